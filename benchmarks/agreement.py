@@ -17,37 +17,37 @@ from statistics import fmean, median
 import torch
 from torch import Tensor
 
-from benchmarks.cases import Case, cases, versions
+from benchmarks.image_fields import FIELDS
+from benchmarks.kernel_cases import Case, kernel_version, make_cases
 from benchmarks.methods import METHODS
-from benchmarks.pictures import FIELDS
-from benchmarks.tables import Row, Rows, named
-from nerf_lightning.config.compose import composed
+from benchmarks.tables import Row, Rows, name_tables
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.device import CPU, synchronize
 
-MAX_DIFFERENCE = 1e-4
+MAX_RELATIVE_ERROR = 1e-4
 """Of floating numbers that count as equal, as a share of the largest of them."""
-MAX_OTHERS = 1e-3
+MAX_MISMATCH_RATIO = 1e-3
 """Share of whole numbers, or of samples, that may be others altogether."""
-ROUNDS = 15
+TIMED_CALLS = 15
 """Calls of which the median time counts."""
 STEPS = 400
 SCENE = ("dataset=bricks", "dataset.size=64", "dataset.train_views=40", "dataset.val_views=4")
-SMALL = ("dataset.samples=8192", "sampler.samples=96")
+SMALL_BATCH = ("dataset.samples=8192", "sampler.samples=96")
 """Steps that plain PyTorch takes in some hundredths of a second on a CPU."""
-PICTURE = ("+experiment=picture", "dataset.max_side=128", "dataset.pixels=2048")
-OFF = ("snapshots", "orbit", "checkpoints", "progress", "heldout")
-PICTURE_OFF = ("pictures", "enlarge")
+IMAGE = ("+experiment=picture", "dataset.max_side=128", "dataset.pixels=2048")
+DISABLED_CALLBACKS = ("snapshots", "orbit", "checkpoints", "progress", "validation")
+DISABLED_IMAGE_CALLBACKS = ("pictures", "upscale")
 """Callbacks that write what nobody looks at here."""
 MAX_LOSS_DB = 0.3
 """How far the mean over seeds may be below the CPU's."""
 MAX_SEEDS = 4
 """Runs of one seed are some 0.3 dB apart wherever chance or rounding differ, so that a first one below is no proof."""
-FAILURES = (RuntimeError, TypeError)
+DEVICE_ERRORS = (RuntimeError, TypeError)
 """How PyTorch says that a device cannot do something, or has no room for it."""
 
 
-def failure(error: Exception) -> str:
+def describe_failure(error: Exception) -> str:
     """A failure in one line."""
     return f"failed: {' '.join(str(error).split())[:200]}"
 
@@ -55,12 +55,12 @@ def failure(error: Exception) -> str:
 # Kernels
 
 
-def largest(shares: list[float]) -> float:
+def nan_max(shares: list[float]) -> float:
     """The largest; not a number where one is not."""
     return float(torch.tensor(shares, dtype=torch.float64).max()) if shares else 0.0
 
 
-def difference(got: Tensor, wanted: Tensor) -> float:
+def compute_relative_error(got: Tensor, wanted: Tensor) -> float:
     """Largest difference as a share of the largest value wanted."""
     if got.shape != wanted.shape:
         return math.inf
@@ -70,7 +70,7 @@ def difference(got: Tensor, wanted: Tensor) -> float:
     return off / most if most else (0.0 if off == 0 else math.inf)
 
 
-def others(got: Tensor, wanted: Tensor) -> float:
+def compute_mismatch_ratio(got: Tensor, wanted: Tensor) -> float:
     """Share of whole numbers that differ, of those that are not zero."""
     if got.shape != wanted.shape:
         return 1.0
@@ -81,17 +81,17 @@ def compare_dense(got: list[Tensor], wanted: list[Tensor]) -> tuple[float, float
     """The largest difference of outputs, and the share of entries that are others: one by one."""
     pairs = list(zip(got, wanted, strict=True))
     return (
-        largest([difference(a, b) for a, b in pairs if b.is_floating_point()]),
-        largest([others(a, b) for a, b in pairs if not b.is_floating_point()]),
+        nan_max([compute_relative_error(a, b) for a, b in pairs if b.is_floating_point()]),
+        nan_max([compute_mismatch_ratio(a, b) for a, b in pairs if not b.is_floating_point()]),
     )
 
 
-def compare_located(got: list[Tensor], wanted: list[Tensor]) -> tuple[float, float]:
+def compare_rows(got: list[Tensor], wanted: list[Tensor]) -> tuple[float, float]:
     """The same of rows [N, 8] and their weights, which are compared where the rows are the same."""
     if got[0].shape != wanted[0].shape:
         return math.inf, 1.0
     same = (got[0] == wanted[0]).all(1)
-    return difference(got[1][same], wanted[1][same]), 1 - float(same.double().mean())
+    return compute_relative_error(got[1][same], wanted[1][same]), 1 - float(same.double().mean())
 
 
 def compare_packed(got: list[Tensor], wanted: list[Tensor]) -> tuple[float, float]:
@@ -105,10 +105,10 @@ def compare_packed(got: list[Tensor], wanted: list[Tensor]) -> tuple[float, floa
     if not (len(places) and len(expected)):
         return 0.0, float(len(places) != len(expected))
     (off, counterpart), (theirs, _) = find_nearest(places, expected), find_nearest(expected, places)
-    met, lonely = off <= MAX_DIFFERENCE * longest, int((~(theirs <= MAX_DIFFERENCE * longest)).sum())
-    lengths = difference(got[1][met], wanted[1][counterpart[met]])
+    met, lonely = off <= MAX_RELATIVE_ERROR * longest, int((~(theirs <= MAX_RELATIVE_ERROR * longest)).sum())
+    lengths = compute_relative_error(got[1][met], wanted[1][counterpart[met]])
     share = (int((~met).sum()) + lonely) / len(expected)
-    return largest([*(off[met] / longest).tolist(), lengths]), share
+    return nan_max([*(off[met] / longest).tolist(), lengths]), share
 
 
 def find_nearest(places: Tensor, among: Tensor) -> tuple[Tensor, Tensor]:
@@ -119,31 +119,31 @@ def find_nearest(places: Tensor, among: Tensor) -> tuple[Tensor, Tensor]:
     return (among[which] - places).abs(), which
 
 
-COMPARISONS = {"dense": compare_dense, "located": compare_located, "packed": compare_packed}
+COMPARISONS = {"dense": compare_dense, "rows": compare_rows, "packed": compare_packed}
 
 
-def random_like(outputs: list[Tensor]) -> list[Tensor]:
+def make_random_like(outputs: list[Tensor]) -> list[Tensor]:
     """The same normal numbers on every device, laid out in memory as the outputs are."""
     generator = torch.Generator().manual_seed(7)
     return [torch.empty_like(x).copy_(torch.randn(x.shape, generator=generator)) for x in outputs]
 
 
-def values_and_gradients(case: Case, device: torch.device, choice: str) -> tuple[list[Tensor], list[Tensor]]:
+def run_case(case: Case, device: torch.device, choice: str) -> tuple[list[Tensor], list[Tensor]]:
     """Brought to the CPU."""
-    with versions(choice):
-        inputs = case.on(device)
+    with kernel_version(choice):
+        inputs = case.to_device(device)
         values = case.outputs(inputs)
-        gradients = case.gradients(inputs, values, random_like(values))
+        gradients = case.gradients(inputs, values, make_random_like(values))
     return [x.detach().cpu() for x in values], [x.cpu() for x in gradients]
 
 
-def milliseconds(case: Case, device: torch.device, choice: str) -> float:
+def time_case(case: Case, device: torch.device, choice: str) -> float:
     """Median time of one version of a kernel, with the gradient where it has one, after two calls to warm up."""
     times = []
-    with versions(choice), torch.set_grad_enabled(case.learns > 0):
-        inputs = case.on(device)
-        above = random_like(case.outputs(inputs))
-        for _ in range(2 + ROUNDS):
+    with kernel_version(choice), torch.set_grad_enabled(case.num_trainable > 0):
+        inputs = case.to_device(device)
+        above = make_random_like(case.outputs(inputs))
+        for _ in range(2 + TIMED_CALLS):
             synchronize(device)
             start = time.perf_counter()
             case.gradients(inputs, case.outputs(inputs), above)
@@ -152,22 +152,22 @@ def milliseconds(case: Case, device: torch.device, choice: str) -> float:
     return 1e3 * median(times[2:])
 
 
-def compare(case: Case, device: torch.device) -> Row:
+def compare_kernel(case: Case, device: torch.device) -> Row:
     """A kernel on a device beside the reference on the CPU."""
     (values, gradients), (wanted, wanted_gradients) = (
-        values_and_gradients(case, *version) for version in ((device, "auto"), (CPU, "reference"))
+        run_case(case, *version) for version in ((device, "auto"), (CPU, "reference"))
     )
     value, other = COMPARISONS[case.kind](values, wanted)
     gradient, _ = compare_dense(gradients, wanted_gradients)
     found = []
-    if not value <= MAX_DIFFERENCE:
+    if not value <= MAX_RELATIVE_ERROR:
         found.append(f"value, {value:.1e} apart")
-    if not other <= MAX_OTHERS:
+    if not other <= MAX_MISMATCH_RATIO:
         found.append(f"value, {100 * other:.3g}% of entries are others")
-    if not gradient <= MAX_DIFFERENCE:
+    if not gradient <= MAX_RELATIVE_ERROR:
         found.append(f"gradient, {gradient:.1e} apart")
-    ours, plain = (milliseconds(case, device, choice) for choice in ("auto", "reference"))
-    apart = {"value_apart": value, "entries_other": other, "gradient_apart": gradient if case.learns else None}
+    ours, plain = (time_case(case, device, choice) for choice in ("auto", "reference"))
+    apart = {"value_apart": value, "entries_other": other, "gradient_apart": gradient if case.num_trainable else None}
     times = {"fast_ms": ours, "reference_ms": plain, "times_faster": plain / ours}
     return {**apart, **times, "differs": "; ".join(found)}
 
@@ -175,11 +175,11 @@ def compare(case: Case, device: torch.device) -> Row:
 def compare_kernels(device: torch.device) -> Rows:
     """A line a kernel, on the work of one training step."""
     rows: Rows = []
-    for name, case in cases().items():
+    for name, case in make_cases().items():
         try:
-            row = compare(case, device)
-        except FAILURES as error:
-            row = {"differs": failure(error)}
+            row = compare_kernel(case, device)
+        except DEVICE_ERRORS as error:
+            row = {"differs": describe_failure(error)}
         rows.append({"kernel": name, **row})
         print(f"agreement: {name}: {row['differs'] or 'equal'}", flush=True)
     return rows
@@ -188,22 +188,24 @@ def compare_kernels(device: torch.device) -> Rows:
 # Trainings
 
 
-def short_trainings() -> dict[str, list[str]]:
+def list_short_trainings() -> dict[str, list[str]]:
     """Overrides of each method's short training."""
-    off, picture_off = ([f"callbacks.{name}=null" for name in names] for names in (OFF, PICTURE_OFF))
+    off, picture_off = (
+        [f"callbacks.{name}=null" for name in names] for names in (DISABLED_CALLBACKS, DISABLED_IMAGE_CALLBACKS)
+    )
     # As many rays a step on every device: with more it would learn more.
-    common = [f"budget.steps={STEPS}", "limits.batch=1", "~logger", *off]
+    common = [f"budget.steps={STEPS}", "limits.batch_scale=1", "~logger", *off]
     return {
-        **{name: [*SCENE, *SMALL, f"recipe={name}_medium", *common] for name in METHODS},
-        **{name: [*PICTURE, f"model={name}", *common, *picture_off] for name in FIELDS},
+        **{name: [*SCENE, *SMALL_BATCH, f"recipe={name}_medium", *common] for name in METHODS},
+        **{name: [*IMAGE, f"model={name}", *common, *picture_off] for name in FIELDS},
     }
 
 
-def train_quietly(overrides: list[str], kernels: str, seed: int, device: torch.device, folder: Path) -> float:
+def train_silently(overrides: list[str], kernels: str, seed: int, device: torch.device, folder: Path) -> float:
     """Held-out PSNR of a run in this process, which says nothing."""
     given = [*overrides, f"kernels={kernels}", f"seed={seed}", f"device={device.type}"]
-    with versions(kernels), redirect_stdout(io.StringIO()):
-        found: float | None = train(composed(given, folder), folder=folder)
+    with kernel_version(kernels), redirect_stdout(io.StringIO()):
+        found: float | None = train(compose_config(given, folder), folder=folder)
     return math.nan if found is None else found
 
 
@@ -211,8 +213,8 @@ def compare_training(overrides: list[str], device: torch.device, seed: int, fold
     """A method's mean PSNR on both; one seed more is asked as long as those before stand below the CPU."""
     there, here = [], []
     for one in range(seed, seed + MAX_SEEDS):
-        there.append(train_quietly(overrides, "auto", one, device, folder / f"device_{one}"))
-        here.append(train_quietly(overrides, "reference", one, CPU, folder / f"reference_{one}"))
+        there.append(train_silently(overrides, "auto", one, device, folder / f"device_{one}"))
+        here.append(train_silently(overrides, "reference", one, CPU, folder / f"reference_{one}"))
         below = fmean(here) - fmean(there)
         if below <= MAX_LOSS_DB:
             break
@@ -223,11 +225,11 @@ def compare_training(overrides: list[str], device: torch.device, seed: int, fold
 def compare_trainings(device: torch.device, seed: int, output: Path) -> Rows:
     """A line a method: whether it learns on a device as well as on the CPU with plain PyTorch, from the same seed."""
     rows: Rows = []
-    for name, overrides in short_trainings().items():
+    for name, overrides in list_short_trainings().items():
         try:
             row = compare_training(overrides, device, seed, output / "trainings" / name)
-        except FAILURES as error:
-            row = {"differs": failure(error)}
+        except DEVICE_ERRORS as error:
+            row = {"differs": describe_failure(error)}
         rows.append({"method": name, **row})
         print(f"agreement: {name}: {row['differs'] or 'equal'}", flush=True)
     return rows
@@ -236,4 +238,4 @@ def compare_trainings(device: torch.device, seed: int, output: Path) -> Rows:
 def measure(args: argparse.Namespace) -> Rows:
     """Both tables."""
     trainings = compare_trainings(args.device, args.seeds[0], args.output)
-    return named({"kernels": compare_kernels(args.device), "short trainings": trainings})
+    return name_tables({"kernels": compare_kernels(args.device), "short trainings": trainings})

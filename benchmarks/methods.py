@@ -14,22 +14,22 @@ from benchmarks.tables import Row, Rows
 METHODS = ("tensorf", "hashgrid", "voxels", "mlp")
 """In 3D; the recipe of each in its usual size ends in _medium."""
 TARGETS_DB = (24, 27, 30)
-MOMENTS = (10, 30, 60, 300)
-CHECKS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 180, 240)
+REPORT_SECONDS = (10, 30, 60, 300)
+CHECK_SECONDS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 180, 240)
 """Seconds of training after which a run is measured, where its budget is longer."""
 
 Run = dict[str, Any]
 
 
-def marks(seconds: float) -> str:
+def format_fractions(seconds: float) -> str:
     """Shares of a budget at which a run is measured."""
-    return ",".join(str(check / seconds) for check in CHECKS if check < seconds)
+    return ",".join(str(check / seconds) for check in CHECK_SECONDS if check < seconds)
 
 
 def train(experiment: str, overrides: list[str], seed: int, folder: Path, measured_at: str = "") -> Run:
     """One run; returns its results.json."""
     command = [sys.executable, "-m", "nerf_lightning", f"+experiment={experiment}", *overrides]
-    command += [f"seed={seed}", f"callbacks.heldout.at=[{measured_at}]"]
+    command += [f"seed={seed}", f"callbacks.validation.fractions=[{measured_at}]"]
     command += ["callbacks.snapshots.steps=[]", "callbacks.orbit=null", f"hydra.run.dir='{folder}'"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -37,18 +37,18 @@ def train(experiment: str, overrides: list[str], seed: int, folder: Path, measur
     return json.loads((folder / "results.json").read_text(encoding="utf-8"))
 
 
-def seconds_to(curve: list[list[float]], target: float) -> float | None:
+def find_seconds_to_psnr(curve: list[list[float]], target: float) -> float | None:
     """Training seconds at which the curve [[seconds, step, dB], ...] first stands at the target."""
     return next((seconds for seconds, _, quality in curve if quality >= target), None)
 
 
-def middle(values: list[float | None]) -> float | None:
+def censored_median(values: list[float | None]) -> float | None:
     """The median; None where more than half of the values are missing (they count as infinitely large)."""
     known = median(float("inf") if value is None else value for value in values)
     return None if known == float("inf") else known
 
 
-def summary(method: str, by_budget: dict[float, list[Run]]) -> Row:
+def summarize(method: str, by_budget: dict[float, list[Run]]) -> Row:
     """One line of the table: medians over seeds.
 
     Seconds to a quality come from the budget that gets there first; dB at a moment from the shortest budget that lasts so
@@ -56,9 +56,11 @@ def summary(method: str, by_budget: dict[float, list[Run]]) -> Row:
     """
     row: Row = {"method": method, "seeds": min(len(runs) for runs in by_budget.values())}
     for target in TARGETS_DB:
-        times = [middle([seconds_to(run["curve"], target) for run in runs]) for runs in by_budget.values()]
+        times = [
+            censored_median([find_seconds_to_psnr(run["curve"], target) for run in runs]) for runs in by_budget.values()
+        ]
         row[f"seconds_to_{target}_db"] = min((t for t in times if t is not None), default=None)
-    for moment in MOMENTS:
+    for moment in REPORT_SECONDS:
         budget = min((seconds for seconds in by_budget if seconds >= moment), default=None)
         if budget is not None:
             row[f"db_at_{moment}_s"] = median(
@@ -84,12 +86,12 @@ def measure(args: argparse.Namespace) -> Rows:
             given = [*args.overrides, f"device={args.device.type}", f"budget.seconds={seconds}"]
             place = args.output / f"{experiment}_{seconds:g}s_seed{seed}"
             try:
-                run = train(experiment, given, seed, place, marks(seconds))
+                run = train(experiment, given, seed, place, format_fractions(seconds))
             except SystemExit as failure:
                 rows.append({"method": experiment, "differs": str(failure)})
                 break
             print(f"methods: {experiment}, {seconds:g} s, seed {seed}: {run['psnr']:.2f} dB", flush=True)
             by_budget.setdefault(seconds, []).append(run)
         else:
-            rows.append(summary(experiment, by_budget))
+            rows.append(summarize(experiment, by_budget))
     return rows

@@ -12,24 +12,30 @@ import nerf_lightning as nl
 from benchmarks.tables import Rows
 from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.dataset import Scene, Views
-from nerf_lightning.synthetic.objects import PILE, bound_bodies, make_scene, place_cameras, render_photos
+from nerf_lightning.synthetic.objects import (
+    PILE,
+    bound_primitives,
+    make_hemisphere_cameras,
+    make_object_scene,
+    render_photos,
+)
 
 SIZE, VIEWS, HELD_OUT = 128, 48, 6
 STEPS = 1500
 GREY = (0.5, 0.5, 0.5)
-BOXED = 0.3
+BOXED_FRACTION = 0.3
 """Share of the training photos that have boxes pasted on."""
 FISHEYE = Distortion(k1=-0.02, k2=0.004)
-QUIET = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger", "callbacks.heldout=null")
+DISABLED_OUTPUTS = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger", "callbacks.validation=null")
 
 
-def joined(parts: Sequence[Views]) -> Views:
+def concatenate_views(parts: Sequence[Views]) -> Views:
     """Views of several sizes, one after the other."""
     K, c2w, sizes = (torch.cat([getattr(part.cameras, name) for part in parts]) for name in ("K", "c2w", "sizes"))
     return Views(torch.cat([part.pixels for part in parts]), Cameras(K, c2w, sizes))
 
 
-def cropped(views: Views, left: int, top: int) -> Views:
+def crop_views(views: Views, left: int, top: int) -> Views:
     """Photos without margins of so many pixels on either side."""
     cameras = views.cameras
     K = cameras.K.clone()
@@ -37,56 +43,58 @@ def cropped(views: Views, left: int, top: int) -> Views:
     K[:, 1, 2] -= top
     width, height = cameras.width - 2 * left, cameras.height - 2 * top
     images = views.images[:, top : top + height, left : left + width]
-    return Views.of(images.contiguous(), Cameras.of_size(K, cameras.c2w, width, height))
+    return Views.from_images(images.contiguous(), Cameras.pinhole(K, cameras.c2w, width, height))
 
 
-def of_several_sizes(scene: Scene) -> Scene:
+def resize_views(scene: Scene) -> Scene:
     """A third of the training photos is landscape, a third portrait, a third halved in size."""
     train = scene.train
     thirds = [train[torch.arange(first, len(train), 3)] for first in range(3)]
-    small = thirds[2].cameras.scaled(0.5)
-    halved = Views.of(render_photos(PILE, small, scene.background), small)
+    small = thirds[2].cameras.rescale(0.5)
+    halved = Views.from_images(render_photos(PILE, small, scene.background), small)
     margin = SIZE // 8
-    return replace(scene, train=joined([cropped(thirds[0], 0, margin), cropped(thirds[1], margin, 0), halved]))
+    return replace(
+        scene, train=concatenate_views([crop_views(thirds[0], 0, margin), crop_views(thirds[1], margin, 0), halved])
+    )
 
 
-def with_boxes(scene: Scene, seed: int) -> tuple[Scene, Scene]:
+def paste_boxes(scene: Scene, seed: int) -> tuple[Scene, Scene]:
     """Random boxes pasted over some training photos; and the same with masks of them."""
     generator = torch.Generator().manual_seed(seed)
     images = scene.train.images.clone()
     known = torch.ones(images.shape[:3], dtype=torch.bool)
-    for view in torch.randperm(len(images), generator=generator)[: round(BOXED * len(images))].tolist():
+    for view in torch.randperm(len(images), generator=generator)[: round(BOXED_FRACTION * len(images))].tolist():
         for _ in range(3):
             top, left = torch.randint(SIZE, (2,), generator=generator).tolist()
             height, width = torch.randint(SIZE // 5, SIZE // 2, (2,), generator=generator).tolist()
             place = slice(top, top + height), slice(left, left + width)
             images[view][place] = torch.randint(256, (3,), generator=generator).to(torch.uint8)
             known[view][place] = False
-    spoiled = Views.of(images, scene.train.cameras)
-    masked = replace(spoiled, known=known.flatten())
+    spoiled = Views.from_images(images, scene.train.cameras)
+    masked = replace(spoiled, valid_mask=known.flatten())
     return replace(scene, train=spoiled), replace(scene, train=masked)
 
 
-def through_fisheye(views: int, phase: float) -> Views:
+def render_fisheye(views: int, phase: float) -> Views:
     """Photos of the same field of view as those of `around`, through a fisheye."""
-    straight = place_cameras(views, SIZE, phase)
+    straight = make_hemisphere_cameras(views, SIZE, phase)
     K = straight.K.clone()
     half = math.atan(float(0.5 * SIZE / K[0, 0, 0]))
     focal = 0.5 * SIZE / (half * (1 + FISHEYE.k1 * half**2 + FISHEYE.k2 * half**4))
     K[:, 0, 0] = K[:, 1, 1] = focal
     lenses = Lenses(torch.tensor([FISHEYE]).repeat(views, 1), torch.full((views,), Projection.FISHEYE))
     cameras = Cameras(K, straight.c2w, straight.sizes, lenses)
-    return Views.of(render_photos(PILE, cameras, GREY), cameras)
+    return Views.from_images(render_photos(PILE, cameras, GREY), cameras)
 
 
 def measure(args: argparse.Namespace) -> Rows:
     """The table, a line a kind of photos."""
-    plain = replace(make_scene(PILE, GREY, SIZE, VIEWS, HELD_OUT), bounds=bound_bodies(PILE))
-    boxes, masks = with_boxes(plain, args.seeds[0])
-    fisheye = replace(plain, train=through_fisheye(VIEWS, 0.0), val=through_fisheye(HELD_OUT, 0.7))
+    plain = replace(make_object_scene(PILE, GREY, SIZE, VIEWS, HELD_OUT), bounds=bound_primitives(PILE))
+    boxes, masks = paste_boxes(plain, args.seeds[0])
+    fisheye = replace(plain, train=render_fisheye(VIEWS, 0.0), val=render_fisheye(HELD_OUT, 0.7))
     scenes = {
         "one size": plain,
-        "several sizes": of_several_sizes(plain),
+        "several sizes": resize_views(plain),
         "boxes": boxes,
         "boxes, masked": masks,
         "fisheye": fisheye,
@@ -97,7 +105,9 @@ def measure(args: argparse.Namespace) -> Rows:
         for seed in args.seeds:
             print(f"photos: {name}, seed {seed}", flush=True)
             folder = args.output / "photos" / f"{name}_{seed}".replace(" ", "_")
-            found.append(nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=QUIET).psnr)
+            found.append(
+                nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=DISABLED_OUTPUTS).psnr
+            )
         held = scene.train
         row = {"photos": name, "psnr": fmean(found), "bytes/pixel": held.nbytes / len(held.pixels)}
         rows.append(row)

@@ -12,36 +12,42 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from benchmarks.cameras import similarity
-from benchmarks.capture import SHEETS
+from benchmarks.camera_noise import fit_similarity
+from benchmarks.capture_accuracy import SHEETS
 from benchmarks.synthetic.photos import Flaws, render_photo
-from benchmarks.synthetic.video import place_cameras, with_blurs, write_video
+from benchmarks.synthetic.video import blur_images, place_cameras, write_video
 from benchmarks.tables import Row, Rows
-from nerf_lightning.cameras import Distortion, in_other_frame
-from nerf_lightning.capture.poses.geometry import angle_between, inverse
+from nerf_lightning.cameras import Distortion, transform_poses
+from nerf_lightning.capture.poses.geometry import angle_between, invert_pose
 from nerf_lightning.dataset.intrinsics import Intrinsics
-from nerf_lightning.dataset.sfm.frames import write_frames
-from nerf_lightning.dataset.sfm.photos import place_photos
-from nerf_lightning.synthetic.tracer import map_shadow
+from nerf_lightning.dataset.sfm.photo_folder import run_sfm
+from nerf_lightning.dataset.sfm.video_frames import write_frames
+from nerf_lightning.synthetic.tracer import render_shadow_map
 
 LENS = Intrinsics(480, 360, 420.0, 420.0, 242.0, 178.0, Distortion(k1=-0.1, k2=0.02))
 FLAWS = Flaws(blur=0.4, noise=2.0)
-TURN, PAUSE = 120, 30
+TURN_FRAMES, PAUSE_FRAMES = 120, 30
 """Pictures of a full turn; and those for which the camera stands still, after a third of it."""
-COUNTS = (20, 40)
+FRAME_COUNTS = (20, 40)
 """Frames to choose: the chance of a blurred one is highest where the stretches are short."""
 
 
 def measure(args: argparse.Namespace) -> Rows:
     """A turn around the bulldozer with a pause, by the number of chosen frames; the largest number is placed as well."""
     layout, seed, folder = SHEETS["six tags"], args.seeds[0], args.output
-    c2w = place_cameras(layout, LENS, TURN)
-    c2w = np.concatenate([c2w[: TURN // 3], np.repeat(c2w[TURN // 3 : TURN // 3 + 1], PAUSE, axis=0), c2w[TURN // 3 :]])
+    c2w = place_cameras(layout, LENS, TURN_FRAMES)
+    c2w = np.concatenate(
+        [
+            c2w[: TURN_FRAMES // 3],
+            np.repeat(c2w[TURN_FRAMES // 3 : TURN_FRAMES // 3 + 1], PAUSE_FRAMES, axis=0),
+            c2w[TURN_FRAMES // 3 :],
+        ]
+    )
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "turn.mp4"
-    write_video(file, with_blurs(_pictures(c2w, seed), seed))
+    write_video(file, blur_images(_pictures(c2w, seed), seed))
     rows: Rows = []
-    for count in COUNTS:
+    for count in FRAME_COUNTS:
         started = time.perf_counter()
         frames = folder / f"frames_{count}"
         shutil.rmtree(frames, ignore_errors=True)
@@ -54,25 +60,25 @@ def measure(args: argparse.Namespace) -> Rows:
             "frames": len(c2w),
             "chosen": len(taken),
             "blurred_percent_rejected": 100 - 100 * len(set(taken) & set(blurred)) / len(blurred),
-            "chosen_in_pause": sum(TURN // 3 <= index <= TURN // 3 + PAUSE for index in taken),
-            "longest_gap": int(max(np.diff([moving(index) for index in taken]))),
+            "chosen_in_pause": sum(TURN_FRAMES // 3 <= index <= TURN_FRAMES // 3 + PAUSE_FRAMES for index in taken),
+            "longest_gap": int(max(np.diff([count_moving_frames(index) for index in taken]))),
             "choosing_seconds": time.perf_counter() - started,
         }
-        if count == max(COUNTS):
+        if count == max(FRAME_COUNTS):
             started = time.perf_counter()
-            row |= _errors(place_photos(photos[0].parent), c2w, len(taken))
+            row |= _errors(run_sfm(photos[0].parent), c2w, len(taken))
             row["placing_seconds"] = time.perf_counter() - started
         rows.append(row)
     return rows
 
 
-def moving(index: int) -> int:
+def count_moving_frames(index: int) -> int:
     """How many pictures of the turn come before one of the video."""
-    return min(index, max(TURN // 3, index - PAUSE))
+    return min(index, max(TURN_FRAMES // 3, index - PAUSE_FRAMES))
 
 
 def _pictures(c2w: Float[np.ndarray, "N 4 4"], seed: int) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-    map_shadow()  # made once, before the threads ask for it
+    render_shadow_map()  # made once, before the threads ask for it
     layout = SHEETS["six tags"]
 
     def render(index: int) -> UInt8[np.ndarray, "H W 3"]:
@@ -90,8 +96,8 @@ def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> Row:
     images = [image for image in model.images.values() if image.has_pose]
     truth = np.stack([c2w[int(Path(image.name).stem)] for image in images])
     last = [[0.0, 0.0, 0.0, 1.0]]
-    found = np.stack([inverse(np.concatenate([image.cam_from_world().matrix(), last])) for image in images])
-    moved = aligned(found, truth)
+    found = np.stack([invert_pose(np.concatenate([image.cam_from_world().matrix(), last])) for image in images])
+    moved = align_poses(found, truth)
     distance = np.linalg.norm(truth[:, :3, 3] - truth[:, :3, 3].mean(0), axis=-1)
     camera = model.cameras[images[0].camera_id]
     return {
@@ -102,7 +108,7 @@ def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> Row:
     }
 
 
-def aligned(found: Float[np.ndarray, "N 4 4"], truth: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
+def align_poses(found: Float[np.ndarray, "N 4 4"], truth: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
     """Camera poses turned, shifted and scaled so that their centres fit the truth best."""
-    onto = similarity(*(torch.from_numpy(poses[:, :3, 3]) for poses in (found, truth)))
-    return in_other_frame(torch.from_numpy(found), onto).numpy()
+    onto = fit_similarity(*(torch.from_numpy(poses[:, :3, 3]) for poses in (found, truth)))
+    return transform_poses(torch.from_numpy(found), onto).numpy()

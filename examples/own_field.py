@@ -35,6 +35,6 @@ if __name__ == "__main__":
     adam = partial(torch.optim.Adam, lr=0.1)
     nerf = system.NeRF3D(Grid(box), sampler.OccupancySampler(box), behind, adam, system.exponential)
     L.Trainer(max_steps=int(sys.argv[2]), accelerator="cpu", logger=False, enable_checkpointing=False).fit(nerf, data)
-    view = nerf.evaluate(data.held_out(0))
+    view = nerf.evaluate(data.get_held_out_view(0))
     print(f"{view.psnr:.2f} dB on a view it never saw")
     imageio.imwrite("own_field.png", (255 * torch.cat([view.rgb, view.truth], dim=1)).round().byte().numpy())

@@ -13,7 +13,7 @@ import nerf_lightning as nl
 from nerf_lightning import dataset, model, renderer, sampler, system
 
 
-class ClearCut(system.NeRF3D):
+class EntropyNeRF3D(system.NeRF3D):
     def regularize(self, output, samples, batch):
         o = output.opacity.clamp(1e-3, 1 - 1e-3)
         entropy = -(o * o.log() + (1 - o) * (1 - o).log()).mean()
@@ -25,6 +25,6 @@ if __name__ == "__main__":
     data, box = dataset.RayDataModule(scene), scene.bounds
     behind = renderer.VolumeRenderer(scene_background=scene.background)
     adam = partial(torch.optim.Adam, lr=0.01)
-    nerf = ClearCut(model.HashGridField(box), sampler.OccupancySampler(box), behind, adam, system.exponential)
+    nerf = EntropyNeRF3D(model.HashGridField(box), sampler.OccupancySampler(box), behind, adam, system.exponential)
     L.Trainer(max_steps=int(sys.argv[2]), accelerator="cpu", logger=False, enable_checkpointing=False).fit(nerf, data)
-    print(f"{nerf.evaluate(data.held_out(0)).psnr:.2f} dB on a view it never saw")
+    print(f"{nerf.evaluate(data.get_held_out_view(0)).psnr:.2f} dB on a view it never saw")

@@ -16,7 +16,7 @@ from nerf_lightning import dataset, model, renderer, sampler, system
 class Geometric(sampler.Sampler):
     def forward(self, rays, density, generator=None):
         near, far = self.bounds.near_far(rays)
-        near, hit = near.clamp_min(1e-2 * self.bounds.longest)[:, None], (far > near)[:, None]
+        near, hit = near.clamp_min(1e-2 * self.bounds.max_half_size)[:, None], (far > near)[:, None]
         shift = torch.zeros(len(rays), 1) if generator is None else torch.rand(len(rays), 1, generator=generator)
         s = ((torch.arange(97) - shift) / 96).clamp(0, 1)
         edges = near * (far[:, None].maximum(near) / near) ** s
@@ -30,4 +30,4 @@ if __name__ == "__main__":
     adam = partial(torch.optim.Adam, lr=0.01)
     nerf = system.NeRF3D(model.HashGridField(box), Geometric(box), behind, adam, system.exponential)
     L.Trainer(max_steps=int(sys.argv[2]), accelerator="cpu", logger=False, enable_checkpointing=False).fit(nerf, data)
-    print(f"{nerf.evaluate(data.held_out(0)).psnr:.2f} dB on a view it never saw")
+    print(f"{nerf.evaluate(data.get_held_out_view(0)).psnr:.2f} dB on a view it never saw")

@@ -25,26 +25,26 @@ from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.render import render as render_run
 from nerf_lightning.cli.rightsize import rightsize
 from nerf_lightning.cli.view import view
-from nerf_lightning.config.compose import composed
-from nerf_lightning.config.literal import override_of
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.quoting import make_override
 from nerf_lightning.dataset import PhotoLoadOptions, Scene, open_scene
-from nerf_lightning.dataset.resize import AUTO, auto_resize
-from nerf_lightning.kernels.switch import chosen_kernels, use_kernels
-from nerf_lightning.runs.index import read_run
+from nerf_lightning.dataset.resize import AUTO, compute_auto_resize
+from nerf_lightning.kernels.backend import get_kernels, set_kernels
 from nerf_lightning.runs.open import open_scene_run
-from nerf_lightning.runs.owner import Taken, own_folder
+from nerf_lightning.runs.run_lock import RunFolderInUse, lock_new_run_folder
+from nerf_lightning.runs.summaries import read_run
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.training.train import train as train_configured
-from nerf_lightning.utils.device import the_device
-from nerf_lightning.utils.files import user_path
-from nerf_lightning.utils.signals import Interrupted, handle_signals
+from nerf_lightning.utils.device import resolve_device
+from nerf_lightning.utils.files import expand_user_path
+from nerf_lightning.utils.signals import SignalInterrupt, handle_signals
 
 __all__ = ["Run", "View", "compare", "load_run", "load_scene", "rightsize", "train"]
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def _as_method(function: Callable[P, T]) -> Callable[P, T]:
+def _make_method(function: Callable[P, T]) -> Callable[P, T]:
     """A command as a method of what has the run's path, with the same options; it leaves the process as it was."""
 
     @functools.wraps(function)
@@ -86,14 +86,14 @@ class Run:
 
     def render(self, camera: Cameras) -> View:
         """Renders the first of some cameras, for example `scene.val.cameras[0]`; the result is on the CPU."""
-        found = self.system.render(camera.view_rays(0).to(self.system.device))
+        found = self.system.render(camera.generate_view_rays(0).to(self.system.device))
         shape = (camera.height, camera.width)
         rgb, opacity, depth = (x.cpu() for x in (found.rgb, found.opacity, found.depth))
         return View(rgb.clamp(0, 1).view(*shape, 3), opacity.view(shape), depth.view(shape))
 
-    evaluate = _as_method(evaluate)
-    render_video = _as_method(render_run)
-    view = _as_method(view)
+    evaluate = _make_method(evaluate)
+    render_video = _make_method(render_run)
+    view = _make_method(view)
 
     @property
     def export(self) -> "Exports":
@@ -107,12 +107,12 @@ class Exports:
 
     path: Path
 
-    compact = _as_method(commands.export_compact)
-    html = _as_method(commands.export_html)
-    mesh = _as_method(commands.export_mesh)
-    points = _as_method(commands.export_points)
-    transforms = _as_method(commands.export_transforms)
-    voxels = _as_method(commands.export_voxels)
+    compact = _make_method(commands.export_compact)
+    html = _make_method(commands.export_html)
+    mesh = _make_method(commands.export_mesh)
+    points = _make_method(commands.export_points)
+    transforms = _make_method(commands.export_transforms)
+    voxels = _make_method(commands.export_voxels)
 
 
 def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
@@ -126,7 +126,7 @@ def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
     Raises:
         InputError: if there is none, or it is damaged.
     """
-    return open_scene(os.path.abspath(user_path(path)), options=PhotoLoadOptions(resize))
+    return open_scene(os.path.abspath(expand_user_path(path)), options=PhotoLoadOptions(resize))
 
 
 def load_run(path: str | Path, device: str = "auto") -> Run:
@@ -139,9 +139,9 @@ def load_run(path: str | Path, device: str = "auto") -> Run:
     Raises:
         InputError: if there is none, it is broken or a picture's, or the device is not available.
     """
-    place = user_path(path)
+    place = expand_user_path(path)
     with preserve_process_state():
-        found = open_scene_run(place, the_device(device))
+        found = open_scene_run(place, resolve_device(device))
     return Run(place, found.system, found.orbit, read_run(place).results if place.is_dir() else {})
 
 
@@ -173,15 +173,15 @@ def train(
         KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` goes on from it.
     """
     if isinstance(scene, str | Path):
-        size = auto_resize(seconds, steps, the_device(device), torch.get_num_threads())
-        scene = open_scene(os.path.abspath(user_path(scene)), options=PhotoLoadOptions(size))
+        size = compute_auto_resize(seconds, steps, resolve_device(device), torch.get_num_threads())
+        scene = open_scene(os.path.abspath(expand_user_path(scene)), options=PhotoLoadOptions(size))
     default = Path("outputs", scene.name, datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
-    place = default if folder is None else user_path(folder)
+    place = default if folder is None else expand_user_path(folder)
     given = [
         "dataset=photos",
-        override_of("dataset.path", scene.source),
-        f"dataset.resize={scene.train.cameras.longest}",
-        override_of("name", scene.name),
+        make_override("dataset.path", scene.source),
+        f"dataset.resize={scene.train.cameras.max_side}",
+        make_override("name", scene.name),
         f"seed={seed}",
         f"device={device}",
         f"budget.seconds={'null' if seconds is None else seconds}",
@@ -190,12 +190,12 @@ def train(
     ]
     try:
         with preserve_process_state(), handle_signals():
-            cfg = composed([*given, *options], place)
-            with own_folder(place, cfg.overwrite, renamed=folder is None) as place:
+            cfg = compose_config([*given, *options], place)
+            with lock_new_run_folder(place, cfg.overwrite, allow_suffix=folder is None) as place:
                 train_configured(cfg, folder=place, scene=scene)
-    except Taken as error:
+    except RunFolderInUse as error:
         raise FileExistsError(f"{error}; load_run opens it, another folder= keeps both") from error
-    except Interrupted as interrupted:
+    except SignalInterrupt as interrupted:
         signal.raise_signal(interrupted.signum)  # to the caller's own handlers
         raise
     return load_run(place, device)
@@ -204,7 +204,7 @@ def train(
 @contextmanager
 def preserve_process_state() -> Iterator[None]:
     """Leaves the process as it was: random numbers, threads, kernels, denormal numbers, warnings, Hydra's state."""
-    hydra, threads, kernels = HydraConfig.instance().cfg, torch.get_num_threads(), chosen_kernels()
+    hydra, threads, kernels = HydraConfig.instance().cfg, torch.get_num_threads(), get_kernels()
     flushed = float(torch.tensor(1e-40) * 1) == 0
     try:
         with warnings.catch_warnings(), isolate_rng():
@@ -212,5 +212,5 @@ def preserve_process_state() -> Iterator[None]:
     finally:
         HydraConfig.instance().cfg = hydra
         torch.set_num_threads(threads)
-        use_kernels(kernels)
+        set_kernels(kernels)
         torch.set_flush_denormal(flushed)

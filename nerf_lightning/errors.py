@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-LONGEST = 500
+MAX_FOUND_CHARS = 500
 """Most letters of what was found: a file may hold any amount, and the line is for a terminal."""
 
 
@@ -19,31 +19,31 @@ class InputError(ValueError):
         key: entry inside it ("" if `where` is enough).
         found: what is there, in words.
         expected: what should be there, in words.
-        todo: what the user can do about it ("" if `expected` is enough).
+        hint: what the user can do about it ("" if `expected` is enough).
     """
 
-    def __init__(self, where: object, key: str, found: str, expected: str, todo: str = ""):
-        place = f"{where}: {key}" if key else f"{where}"
-        if len(found) > LONGEST:
-            found = f"{found[:LONGEST]}..."
-        self.place, self.found, self.expected, self.todo = place, found, expected, todo
-        line = f"{place}: found {found}, expected {expected}" + (f"; {todo}" if todo else "")
+    def __init__(self, where: object, key: str, found: str, expected: str, hint: str = ""):
+        location = f"{where}: {key}" if key else f"{where}"
+        if len(found) > MAX_FOUND_CHARS:
+            found = f"{found[:MAX_FOUND_CHARS]}..."
+        self.location, self.found, self.expected, self.hint = location, found, expected, hint
+        line = f"{location}: found {found}, expected {expected}" + (f"; {hint}" if hint else "")
         super().__init__(" ".join(line.split()))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """So that it comes back whole from another process."""
-        return type(self), (self.place, "", self.found, self.expected, self.todo)
+        return type(self), (self.location, "", self.found, self.expected, self.hint)
 
 
-class NoRoom(InputError):
+class DiskFullError(InputError):
     """A disk, a quota or a limit on files is full. Told as bad input is: the user can make room and go on."""
 
 
 @contextmanager
-def found_in(path: object) -> Iterator[None]:
+def attribute_errors_to(path: object) -> Iterator[None]:
     """Messages about options name the file that holds them, instead of the command line's configuration."""
     try:
         yield
     except InputError as error:
-        key = error.place.removeprefix("config").removeprefix(": ")
-        raise InputError(path, key, error.found, error.expected, error.todo) from error
+        key = error.location.removeprefix("config").removeprefix(": ")
+        raise InputError(path, key, error.found, error.expected, error.hint) from error

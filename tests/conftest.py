@@ -31,17 +31,17 @@ import tests.helpers.typechecker  # noqa: F401  (the hook below imports the firs
 torch.set_flush_denormal(True)
 
 ROOT = Path(__file__).resolve().parents[1]
-UNCHECKED = "nerf_lightning.kernels.cpu"
-HANDLERS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+KERNELS = "nerf_lightning.kernels.cpu"
+DEFAULT_HANDLERS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
 """Python's own: a shell that starts tests in the background has them ignore Ctrl-C."""
 
 
 def checked_modules() -> list[str]:
-    """All modules but those in `UNCHECKED`, whose functions numba must see undecorated, and the packages that hold it."""
+    """All modules but those in `KERNELS`, whose functions numba must see undecorated, and the packages that hold it."""
     files = (file.relative_to(ROOT).with_suffix("") for file in (ROOT / "nerf_lightning").rglob("*.py"))
     names = {".".join(file.parts).removesuffix(".__init__") for file in files}
     # The hook takes a name for everything below it.
-    return sorted(n for n in names if not f"{UNCHECKED}.".startswith(f"{n}.") and not n.startswith(f"{UNCHECKED}."))
+    return sorted(n for n in names if not f"{KERNELS}.".startswith(f"{n}.") and not n.startswith(f"{KERNELS}."))
 
 
 # Before anything imports the package: from here on a wrong shape fails the test that met it.
@@ -57,8 +57,8 @@ from torch.nn.functional import normalize
 
 from benchmarks.synthetic.photos import Flaws, Truth, write_capture
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import use_kernels
-from tests.helpers.fake_device import device, without_doubles  # noqa: F401  (fixtures)
+from nerf_lightning.kernels import set_kernels
+from tests.helpers.fake_device import device, device_without_float64  # noqa: F401  (fixtures)
 from tests.helpers.shared_fixtures import make_once, shared_folder
 
 # The same examples on every machine, none kept: a failure is found again by running the test again.
@@ -78,13 +78,13 @@ def real_data() -> Path:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
+def isolated_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Tests neither read nor fill the user's cache."""
     os.environ["NERF_LIGHTNING_CACHE"] = str(tmp_path_factory.mktemp("cache"))
 
 
 @pytest.fixture(autouse=True, scope="session")
-def kernels_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
+def compile_kernels_once(tmp_path_factory: pytest.TempPathFactory) -> None:
     """On a new machine each kernel is compiled by one test process, itself; the others wait and load what it has cached."""
     compile, folder = Dispatcher.compile, shared_folder(tmp_path_factory)
 
@@ -97,7 +97,7 @@ def kernels_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 @pytest.fixture(autouse=True, scope="session")
-def conf_parsed_once() -> None:
+def parse_conf_once() -> None:
     """Hydra parses the files of conf/ again for each command line, which is a fifth of what composing one takes."""
     load, parsed = yaml.load, {}
 
@@ -114,33 +114,33 @@ def conf_parsed_once() -> None:
 
 
 @pytest.fixture(autouse=True)
-def same_random_numbers() -> None:
+def seed_torch() -> None:
     torch.manual_seed(0)
 
 
 @pytest.fixture(autouse=True)
-def default_signal_handlers() -> None:
+def restore_signal_handlers() -> None:
     """Each test starts with Python's own handlers."""
-    for number, handler in HANDLERS.items():
+    for number, handler in DEFAULT_HANDLERS.items():
         signal.signal(number, handler)
 
 
 @pytest.fixture(autouse=True)
-def fast_kernels() -> Iterator[None]:
+def restore_fast_kernels() -> Iterator[None]:
     """Whatever a test switches, the next one finds the fast kernels."""
     yield
-    use_kernels("auto")
+    set_kernels("auto")
 
 
 @pytest.fixture(params=["auto", "reference"])
-def kernels(request: pytest.FixtureRequest, fast_kernels: None) -> str:
+def kernels(request: pytest.FixtureRequest, restore_fast_kernels: None) -> str:
     """Runs a test with the fast kernels, and again with the reference."""
-    use_kernels(request.param)
+    set_kernels(request.param)
     return request.param
 
 
 @pytest.fixture
-def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
+def run_main(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]):
     """Runs a verb's `main` with arguments in this process, in an empty folder; returns exit code, output and errors."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("NERF_LIGHTNING_TRACEBACK", raising=False)
@@ -159,52 +159,52 @@ def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureF
 
 
 @pytest.fixture
-def inside(verb):
+def run_cli(run_main):
     """Likewise, of `python -m nerf_lightning`."""
     from nerf_lightning.__main__ import main
 
-    return partial(verb, main)
+    return partial(run_main, main)
 
 
 @pytest.fixture(scope="session")
-def small_run(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
+def small_run(tmp_path_factory: pytest.TempPathFactory, isolated_cache: None) -> Path:
     """The folder of a finished run on the built-in scene, seconds long."""
-    from nerf_lightning.config.compose import composed
+    from nerf_lightning.config.compose import compose_config
     from nerf_lightning.training.train import train
 
     def make(folder: Path) -> Path:
         options = ["+experiment=smoke_3d", "dataset.size=16", "budget.steps=10", "callbacks.orbit.frames=0"]
-        train(composed(options, folder))
+        train(compose_config(options, folder))
         return folder
 
     return make_once(tmp_path_factory, "small_run", make)
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Truth]:
+def tag_capture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Truth]:
     """A synthetic capture with a sheet of six tags: folders `calibration` and `photos`, eight photos each, those of
     the object a third of the way around it. Read only."""
-    from tests.helpers.tag_views import SIX, SMALL
+    from tests.helpers.tag_views import SIX_TAGS, SMALL_LENS
 
     def make(folder: Path) -> tuple[Path, Truth]:
-        return folder, write_capture(folder, SIX, SMALL, 8, 8, Flaws(), seed=3, steps=24, samples=2)
+        return folder, write_capture(folder, SIX_TAGS, SMALL_LENS, 8, 8, Flaws(), seed=3, steps=24, samples=2)
 
     return make_once(tmp_path_factory, "capture", make)
 
 
-LOW, HIGH = torch.tensor([-1.0, -1.5, -0.5]), torch.tensor([1.0, 0.5, 1.5])
+BOX_MIN, BOX_MAX = torch.tensor([-1.0, -1.5, -0.5]), torch.tensor([1.0, 0.5, 1.5])
 
 
 @pytest.fixture
 def box() -> Bounds:
-    return Bounds(torch.stack([LOW, HIGH]))
+    return Bounds(torch.stack([BOX_MIN, BOX_MAX]))
 
 
 @pytest.fixture
 def rays() -> Rays:
     """60 rays from outside toward the box, some of which miss; 10 from inside; 1 that certainly misses."""
-    origins = torch.cat([4 * normalize(torch.randn(60, 3), dim=-1), LOW + torch.rand(10, 3) * (HIGH - LOW)])
-    toward = LOW + torch.rand(70, 3) * (HIGH - LOW) * 1.4
+    origins = torch.cat([4 * normalize(torch.randn(60, 3), dim=-1), BOX_MIN + torch.rand(10, 3) * (BOX_MAX - BOX_MIN)])
+    toward = BOX_MIN + torch.rand(70, 3) * (BOX_MAX - BOX_MIN) * 1.4
     directions = normalize(toward - origins, dim=-1)
     away = torch.tensor([[5.0, 5.0, 5.0]])
     return Rays(torch.cat([origins, away]), torch.cat([directions, normalize(away, dim=-1)]))

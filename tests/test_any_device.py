@@ -12,40 +12,40 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.count import Count
+from benchmarks.op_counter import OpCounter
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.export import export_compact, export_mesh, export_points, export_voxels
 from nerf_lightning.cli.render import render
-from nerf_lightning.config.build import build_data, build_system, frame_of
-from nerf_lightning.config.compose import composed
-from nerf_lightning.kernels import use_kernels
+from nerf_lightning.config.build import build_data, build_system, get_metadata
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.kernels import set_kernels
 from nerf_lightning.runs.open import open_scene_run
 from nerf_lightning.system import NeRF3D, System
-from nerf_lightning.system.growth import grow_field, next_stage
-from nerf_lightning.system.system import total_loss
+from nerf_lightning.system.growth import compute_next_stage, upsample_field
+from nerf_lightning.system.system import sum_losses
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.seeding import Stream, step_generator
-from nerf_lightning.view.painter import Painter, Wish
-from tests.helpers.fake_device import NAME, Module
+from nerf_lightning.view.progressive import ProgressiveRenderer, ViewRequest
+from tests.helpers.fake_device import NAME, PretendModule
 from tests.helpers.growth import grow
 from tests.helpers.train_models import MODELS, SCENE
 
 SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
-ON_IT = ("device=pretend", "+trainer.inference_mode=false", "~logger")
+ON_DEVICE = ("device=pretend", "+trainer.inference_mode=false", "~logger")
 """Its tensors know no inference mode."""
-QUICK = ("model.grown=0.5", "sampler.update_every=4", "sampler.warmup=8")
+QUICK = ("model.growth_end=0.5", "sampler.update_every=4", "sampler.warmup=8")
 SAMPLERS = {
     "uniform": ["sampler=uniform", "sampler.samples=16"],
     "stratified": ["sampler=stratified", "sampler.samples=16"],
-    "importance": ["sampler=importance", "sampler.samples=8", "sampler.fine=8"],
-    "proposal": ["sampler=proposal", "sampler.samples=8", "sampler.first=8", "sampler.second=8"],
+    "importance": ["sampler=importance", "sampler.samples=8", "sampler.importance_samples=8"],
+    "proposal": ["sampler=proposal", "sampler.samples=8", "sampler.coarse_samples=8", "sampler.fine_samples=8"],
 }
 
 
-def options(name: str) -> list[str]:
+def small_options(name: str) -> list[str]:
     """A model's, small, growing where it does; with an orbit of two frames."""
-    given = [option for option in MODELS[name] if option not in ("callbacks.orbit=null", "model.grown=1")]
+    given = [option for option in MODELS[name] if option not in ("callbacks.orbit=null", "model.growth_end=1")]
     if name not in SCENES:
         return [f"model={name}", *given]
     if name in ("mlp", "hashgrid"):
@@ -53,139 +53,139 @@ def options(name: str) -> list[str]:
     return [f"model={name}", *given, *QUICK, "callbacks.orbit.frames=2"]
 
 
-def system_of(given: list[str], folder: Path) -> tuple[System, object]:
-    cfg = composed(given, folder)
+def build_system_and_data(given: list[str], folder: Path) -> tuple[System, object]:
+    cfg = compose_config(given, folder)
     data = build_data(cfg)
-    return build_system(cfg, frame_of(data)), data
+    return build_system(cfg, get_metadata(data)), data
 
 
-def stepped(system: System, data: object, steps: int, where: torch.device) -> list[float]:
+def train_steps(system: System, data: object, steps: int, where: torch.device) -> list[float]:
     """The losses of the first steps of a scene's training, drawn alike on every device."""
     optimizer, losses = system.configure_optimizers(), []
     for step in range(steps):
-        system.state.advance(step / steps)
-        if (stage := next_stage(system, step)) is not None:
-            grow_field(system, data, stage, optimizer)
+        system.state.set_progress(step / steps)
+        if (stage := compute_next_stage(system, step)) is not None:
+            upsample_field(system, data, stage, optimizer)
         batch, generator = data.draw(step).to(where), step_generator(0, Stream.STEP, step, where)
         system.sampler.update(step, system.field.density, generator)
         found, stats = system.compute_losses(batch, generator)
-        loss = total_loss(found)
+        loss = sum_losses(found)
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
-        if stats.counted:
-            data.note_samples(stats.samples)
+        if stats.is_sample_count_exact:
+            data.adapt_num_rays(stats.samples)
         losses.append(float(loss.detach()))
     return losses
 
 
 VARIANTS = {
-    **{name: options(name) for name in SCENES},
+    **{name: small_options(name) for name in SCENES},
     **{
         name: [*(one for one in SCENE if not one.startswith("sampler.")), "model=mlp", "model.width=16", *given]
         for name, given in SAMPLERS.items()
     },
     "penalty, one colour behind": [
-        *options("hashgrid"),
+        *small_options("hashgrid"),
         "renderer.distortion_loss_weight=0.01",
         "renderer.background=white",
     ],
-    "random colours behind": [*options("tensorf"), "renderer.background=random"],
+    "random colours behind": [*small_options("tensorf"), "renderer.background=random"],
 }
 
 
 @pytest.mark.parametrize(("variant", "unbounded"), list(zip(VARIANTS, itertools.cycle([False, True]), strict=False)))
-def test_steps_on_device_match_steps_on_cpu(
-    variant: str, unbounded: bool, without_doubles: torch.device, tmp_path: Path
+def test_training_steps_on_device_match_cpu(
+    variant: str, unbounded: bool, device_without_float64: torch.device, tmp_path: Path
 ):
-    use_kernels("reference")
+    set_kernels("reference")
     found = {}
-    for where in (torch.device("cpu"), without_doubles):
+    for where in (torch.device("cpu"), device_without_float64):
         torch.manual_seed(0)
-        system, data = system_of([*VARIANTS[variant], "dataset.samples=null"], tmp_path)
+        system, data = build_system_and_data([*VARIANTS[variant], "dataset.samples=null"], tmp_path)
         assert isinstance(system, NeRF3D) and data.scene.train.images.shape[-1] == 4
         for part in (system.field, system.sampler):
             part.bounds = replace(part.bounds, unbounded=unbounded)
-        found[where.type] = stepped(system.to(where), data, 7, where)
+        found[where.type] = train_steps(system.to(where), data, 7, where)
     assert found[NAME] == pytest.approx(found["cpu"], rel=2e-3)
     assert found[NAME][0] == pytest.approx(found["cpu"][0], rel=1e-5)
 
 
-MOST = {"tensorf": 256, "hashgrid": 255, "voxels": 258, "mlp": 227}
+MAX_OPERATIONS = {"tensorf": 256, "hashgrid": 255, "voxels": 258, "mlp": 227}
 """Operations a step between two updates of the sampler: forward, backward, optimiser. Each takes 5 to 10 microseconds."""
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "hashgrid" else pytest.mark.long) for name in MOST]
+    "name", [pytest.param(name, marks=() if name == "hashgrid" else pytest.mark.long) for name in MAX_OPERATIONS]
 )
-def test_step_on_device_needs_few_operations_and_no_wait(name: str, device: torch.device, tmp_path: Path):
+def test_training_step_on_device_needs_few_operations_and_no_wait(name: str, device: torch.device, tmp_path: Path):
     """As shipped, of a field that has its size; reading a result, or its size, makes the host wait."""
     small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
-    system, data = system_of([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
+    system, data = build_system_and_data([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
     assert isinstance(system, NeRF3D)
     system, period, counts = system.to(device), system.sampler.update_every, []
     optimizer = system.configure_optimizers()
     for step in range(2 * period):
         grow(system.field, 0.9)
         batch = data.draw(step).to(device)
-        with Count() as count:
+        with OpCounter() as count:
             generator = step_generator(0, Stream.STEP, step, device)
             system.sampler.update(step, system.field.density, generator)
             losses, stats = system.compute_losses(batch, generator)
-            total_loss(losses).backward()
+            sum_losses(losses).backward()
             optimizer.step()
             optimizer.zero_grad()
-        if stats.counted:
-            data.note_samples(stats.samples)
+        if stats.is_sample_count_exact:
+            data.adapt_num_rays(stats.samples)
         counts.append(count)
     for count in counts[-period + 3 :]:  # the first ones after an update make what is then kept for the device
-        assert count.operations <= MOST[name], count.names.most_common()
+        assert count.operations <= MAX_OPERATIONS[name], count.names.most_common()
         assert count.waits == 0, count.names.most_common()
     assert 0 < sum(count.waits for count in counts[-period:]) <= 8, "for an update"
 
 
 @pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])
 def test_picture_step_on_device_needs_no_wait(name: str, device: torch.device, tmp_path: Path):
-    system, data = system_of(options(name), tmp_path)
+    system, data = build_system_and_data(small_options(name), tmp_path)
     optimizer, batch = system.to(device).configure_optimizers(), data.draw(0).to(device)
     for _ in range(2):
-        with Count() as count:
+        with OpCounter() as count:
             system.training_step(batch, 0).backward()
             optimizer.step()
             optimizer.zero_grad()
     assert count.waits == 0 and count.operations <= 100, count.names.most_common()
 
 
-def test_rays_beyond_room_do_not_train(device: torch.device, tmp_path: Path):
-    system, data = system_of(options("hashgrid"), tmp_path)
+def test_step_rays_beyond_capacity_do_not_train(device: torch.device, tmp_path: Path):
+    system, data = build_system_and_data(small_options("hashgrid"), tmp_path)
     assert isinstance(system, NeRF3D)
-    stepped(system.to(device), data, 2, device)
+    train_steps(system.to(device), data, 2, device)
     batch, sampler = data.draw(2).to(device), system.sampler
     sampler.update(2, system.field.density, step_generator(0, Stream.STEP, 2, device))
     before = sampler.capacity.per_ray
     assert before is not None, "there is room for as many as were counted"
     narrow = before[0], 0.4 * before[1]
 
-    def drawn(per_ray: tuple[float, float] | None) -> Any:
+    def sample_with_capacity(per_ray: tuple[float, float] | None) -> Any:
         sampler.capacity.per_ray = per_ray
         return sampler(batch.rays, system.field.density, step_generator(0, Stream.STEP, 2, device))
 
     with torch.no_grad():
-        counted, roomy, tight = drawn(None), drawn(before), drawn(narrow)
+        counted, roomy, tight = sample_with_capacity(None), sample_with_capacity(before), sample_with_capacity(narrow)
     ends = counted.offsets.tolist()
-    assert counted.whole is None and roomy.whole.all() and roomy.offsets.tolist() == ends
+    assert counted.complete is None and roomy.complete.all() and roomy.offsets.tolist() == ends
     torch.testing.assert_close(roomy.t[: ends[-1]].cpu(), counted.t.cpu())
     assert len(roomy) > len(counted) and not roomy.dt[ends[-1] :].any()
-    assert tight.whole.tolist() == [end <= len(tight) for end in ends[1:]] and not tight.whole.all()
+    assert tight.complete.tolist() == [end <= len(tight) for end in ends[1:]] and not tight.complete.all()
 
     def loss(pixels: torch.Tensor) -> float:
         sampler.capacity.per_ray = narrow
         changed = replace(batch, pixels=pixels)
         losses, _ = system.compute_losses(changed, step_generator(0, Stream.STEP, 2, device))
-        return float(total_loss(losses).detach())
+        return float(sum_losses(losses).detach())
 
     others = batch.pixels.clone()
-    others[~tight.whole] = 255 - others[~tight.whole]
+    others[~tight.complete] = 255 - others[~tight.complete]
     assert loss(batch.pixels) == loss(others) > 0
 
 
@@ -195,20 +195,24 @@ def silence_lightning_hints() -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_run_on_device_of_each_model_finishes(name: str, without_doubles: torch.device, tmp_path: Path):
-    train(composed([*options(name), *ON_IT, "budget.steps=12"], tmp_path))
+def test_train_on_device_finishes(name: str, device_without_float64: torch.device, tmp_path: Path):
+    train(compose_config([*small_options(name), *ON_DEVICE, "budget.steps=12"], tmp_path))
     found = json.loads((tmp_path / "results.json").read_text())
     assert found["device"] == NAME and found["machine"]["accelerator"] == NAME and found["steps"] == 12
     assert math.isfinite(found["psnr"]) and not found["recoveries"]
     assert (tmp_path / "snapshots").is_dir() and (tmp_path / "checkpoints" / "last.ckpt").exists()
     assert (tmp_path / "orbit.gif").exists() == (name in SCENES)
-    assert Module.waited > 0, "clocks are read when the device has done its work"
+    assert PretendModule.synchronizations > 0, "clocks are read when the device has done its work"
 
 
-def test_run_of_cpu_is_used_on_device(device: torch.device, tmp_path: Path):
+def test_tools_run_of_cpu_work_on_device(device: torch.device, tmp_path: Path):
     """Judged, filmed, exported and painted."""
     run = tmp_path / "run"
-    train(composed([*options("tensorf"), "device=cpu", "budget.steps=60", "~logger", "callbacks.orbit=null"], run))
+    train(
+        compose_config(
+            [*small_options("tensorf"), "device=cpu", "budget.steps=60", "~logger", "callbacks.orbit=null"], run
+        )
+    )
     judged = evaluate(run, output=tmp_path / "evaluation", worst=1, device=NAME)
     expected = json.loads((run / "results.json").read_text())["psnr"]
     assert judged["device"].startswith(NAME)
@@ -230,6 +234,6 @@ def test_run_of_cpu_is_used_on_device(device: torch.device, tmp_path: Path):
 
     found = open_scene_run(run, device)
     for channel in ("rgb", "depth", "opacity"):
-        wish = Wish(found.orbit.c2w[0].numpy(), 0.8, 1.5, channel, (1.0, 0.5, 0.0), 0.1, math.inf, 64)
-        picture = Painter(found.system, found.orbit).paint(wish, 24, lambda: True)
+        wish = ViewRequest(found.orbit.c2w[0].numpy(), 0.8, 1.5, channel, (1.0, 0.5, 0.0), 0.1, math.inf, 64)
+        picture = ProgressiveRenderer(found.system, found.orbit).render(wish, 24, lambda: True)
         assert picture.shape == (16, 24, 3) and picture.dtype == np.uint8 and picture.std() > 0

@@ -18,10 +18,10 @@ from nerf_lightning.cli.export import export_compact
 from nerf_lightning.cli.render import render
 from nerf_lightning.dataset import Views
 from nerf_lightning.renderer import RenderOutput
-from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
+from nerf_lightning.synthetic.objects import PILE, make_hemisphere_cameras, render_photos
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.view.drawing import frusta
-from tests.helpers.colmap_files import cameras_of, photos, write_colmap
+from nerf_lightning.view.geometry import iterate_frusta
+from tests.helpers.scene_writers import colmap_cameras, write_colmap, write_photos
 
 K1, STEPS = 0.02, 12
 
@@ -30,7 +30,7 @@ K1, STEPS = 0.02, 12
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """16 photos on grey: every second is twice as wide as high; a box is masked in every third."""
     root = tmp_path_factory.mktemp("capture")
-    cameras = place_cameras(16, 24)
+    cameras = make_hemisphere_cameras(16, 24)
     lenses = Lenses(torch.tensor([Distortion(K1)]).repeat(16, 1), torch.full((16,), Projection.FISHEYE))
     square = Cameras(cameras.K, cameras.c2w, cameras.sizes, lenses)
     K = cameras.K.clone()
@@ -39,9 +39,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     names, sizes = [], {}
     for i in range(16):
         camera = (wide if i % 2 else square)[i]
-        some = Views.of(render_photos(PILE, camera, (0.5, 0.5, 0.5)), camera)
-        names += photos(root / "images", some, first=i)
-        sizes[i + 1] = cameras_of(some, "SIMPLE_RADIAL_FISHEYE", (K1,))[1]
+        some = Views.from_images(render_photos(PILE, camera, (0.5, 0.5, 0.5)), camera)
+        names += write_photos(root / "images", some, first=i)
+        sizes[i + 1] = colmap_cameras(some, "SIMPLE_RADIAL_FISHEYE", (K1,))[1]
         mask = np.full((24, camera.width), 255, np.uint8)
         mask[4:15, 3:13] = 0 if i % 3 == 0 else 255
         (root / "masks").mkdir(exist_ok=True)
@@ -54,7 +54,7 @@ def test_run_on_mixed_masked_fisheye_photos_writes_outputs(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     scene = nl.load_scene(folder)
-    assert scene.train.known is not None and scene.train.cameras.lenses is not None
+    assert scene.train.valid_mask is not None and scene.train.cameras.lenses is not None
     assert sorted(map(tuple, scene.val.cameras.sizes.tolist())) == [(24, 24), (24, 24)]
     assert {tuple(size) for size in scene.train.cameras.sizes.tolist()} == {(24, 24), (48, 24)}
     options = ["callbacks.snapshots=null", "callbacks.orbit.frames=2", "~logger", "sampler.samples=32"]
@@ -71,22 +71,26 @@ def test_run_on_mixed_masked_fisheye_photos_writes_outputs(
 
     export_compact(run.path, loss_db=20.0, device="cpu")
     assert (tmp_path / "run/compact.npz").exists()
-    assert len(list(frusta(scene.train, 16))) == len(scene.train)
+    assert len(list(iterate_frusta(scene.train, 16))) == len(scene.train)
 
 
-def test_run_nan_pictures_and_corrections_is_collapsed(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_run_nan_renders_is_collapsed(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     render_well = NeRF3D.render
 
     def render_badly(self: NeRF3D, *given: Any) -> RenderOutput:
         rendered = render_well(self, *given)
-        self.corrections.poses.motions.data.fill_(torch.nan)
+        self.corrections.poses.pose_adjustment.data.fill_(torch.nan)
         return replace(rendered, rgb=rendered.rgb * torch.nan)
 
-    options = ["callbacks.snapshots=null", "callbacks.orbit=null", "callbacks.heldout.at=[0.5]", "~logger"]
+    options = ["callbacks.snapshots=null", "callbacks.orbit=null", "callbacks.validation.fractions=[0.5]", "~logger"]
     options += ["sampler.samples=32", "refine=both"]
     monkeypatch.setattr(NeRF3D, "render", render_badly)
-    monkeypatch.setattr(evaluation, "aligned_psnr", lambda system, views, share: [math.nan] * len(views))  # takes long
+    monkeypatch.setattr(
+        evaluation, "measure_aligned_psnr", lambda _, views, fraction: [math.nan] * len(views)
+    )  # takes long
     found = nl.train(folder, steps=4, seed=1, device="cpu", folder=tmp_path / "run", options=options).results
-    assert found["status"] == "collapsed" and "corrections.poses.motions is no longer finite" in found["diagnosis"]
+    assert (
+        found["status"] == "collapsed" and "corrections.poses.pose_adjustment is no longer finite" in found["diagnosis"]
+    )
     assert found["psnr"] is None and found["psnr_aligned"] is None and found["curve"] == []
     assert found["corrections"] is None

@@ -11,73 +11,73 @@ import torch
 from torch import Tensor
 
 from benchmarks import __main__ as command
-from benchmarks import agreement, cameras, cases, photos, pictures, speed
-from benchmarks.tables import differences
+from benchmarks import agreement, camera_noise, image_fields, kernel_cases, photos, step_time
+from benchmarks.tables import list_differences
 from nerf_lightning import kernels
-from nerf_lightning.cameras import in_other_frame
+from nerf_lightning.cameras import transform_poses
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.device import CPU
-from tests.helpers.soft_ball import cameras_around_ball
+from tests.helpers.soft_ball import make_ball_cameras
 
 
 def test_camera_errors_common_motion_does_not_count():
-    truth, centre = cameras_around_ball(6, 8), torch.zeros(3)
+    truth, centre = make_ball_cameras(6, 8), torch.zeros(3)
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.4, 0.1], [0.4, 0.0, 0.2], [-0.1, -0.2, 0.0]]))
     elsewhere = torch.eye(4)
     elsewhere[:3, :3], elsewhere[:3, 3] = 1.7 * turn, torch.tensor([1.0, -2.0, 0.5])
-    together = replace(truth, c2w=in_other_frame(truth.c2w, elsewhere).float())
-    assert max(cameras.errors(together, truth, centre).values()) < 0.1
+    together = replace(truth, c2w=transform_poses(truth.c2w, elsewhere).float())
+    assert max(camera_noise.measure_camera_errors(together, truth, centre).values()) < 0.1
     c2w = truth.c2w.clone()
     angle = torch.tensor(0.1)
     c2w[2, :3, :2] = c2w[2, :3, :2] @ torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
-    found = cameras.errors(replace(truth, c2w=c2w), truth, centre)
+    found = camera_noise.measure_camera_errors(replace(truth, c2w=c2w), truth, centre)
     assert found["degrees"] == pytest.approx(math.degrees(0.1) / 6, rel=1e-2) and found["moved_percent"] < 0.01
 
 
 @pytest.fixture
 def few_samples(monkeypatch: pytest.MonkeyPatch):
     """Kernels' cases that take no time."""
-    monkeypatch.setattr(cases, "RAYS", 64)
-    monkeypatch.setattr(cases, "SAMPLES", 256)
-    monkeypatch.setattr(agreement, "ROUNDS", 1)
+    monkeypatch.setattr(kernel_cases, "NUM_RAYS", 64)
+    monkeypatch.setattr(kernel_cases, "NUM_SAMPLES", 256)
+    monkeypatch.setattr(agreement, "TIMED_CALLS", 1)
 
 
 def spoil(monkeypatch: pytest.MonkeyPatch, name: str, how: Callable[[Tensor], Tensor]) -> None:
     """Spoils the version of a kernel that trainings run, and leaves the reference as it is."""
     right = getattr(kernels, name)
     monkeypatch.setattr(
-        kernels, name, lambda *given: how(right(*given)) if kernels.has_fast(given[0]) else right(*given)
+        kernels, name, lambda *given: how(right(*given)) if kernels.has_fast_kernel(given[0]) else right(*given)
     )
 
 
-def test_compare_kernels_right_ones_are_equal_and_wrong_ones_named(few_samples: None, monkeypatch: pytest.MonkeyPatch):
+def test_compare_kernels_reports_wrong_kernels(few_samples: None, monkeypatch: pytest.MonkeyPatch):
     def refuse(x: Tensor) -> Tensor:
         raise NotImplementedError("not on\nthis device")
 
     rows = agreement.compare_kernels(CPU)
-    assert differences(rows) == [] and all(row["fast_ms"] > 0 and row["reference_ms"] > 0 for row in rows)
-    assert {"march, unbounded", "plane_line_sum", "mark_cells", "voxel_value"} <= {row["kernel"] for row in rows}
+    assert list_differences(rows) == [] and all(row["fast_ms"] > 0 and row["reference_ms"] > 0 for row in rows)
+    assert {"march, unbounded", "plane_line_sum", "mark_cells", "interpolate_scalar"} <= {row["kernel"] for row in rows}
     spoil(monkeypatch, "hash_interpolate", lambda x: x + 0.03 * (x - x.detach()))
     spoil(monkeypatch, "spherical_harmonics", lambda x: x * (1 + 1e-3))
-    spoil(monkeypatch, "points", lambda x: x * torch.nan)
-    spoil(monkeypatch, "voxel_value", refuse)
-    assert differences(agreement.compare_kernels(CPU)) == [
-        "points (value, nan apart)",
+    spoil(monkeypatch, "ray_positions", lambda x: x * torch.nan)
+    spoil(monkeypatch, "interpolate_scalar", refuse)
+    assert list_differences(agreement.compare_kernels(CPU)) == [
+        "ray_positions (value, nan apart)",
         "hash_interpolate (gradient, 3.0e-02 apart)",
         "hash_interpolate_2d (gradient, 3.0e-02 apart)",
         "spherical_harmonics (value, 1.0e-03 apart)",
-        "voxel_value (failed: not on this device)",
+        "interpolate_scalar (failed: not on this device)",
     ]
 
 
 TINY = {
-    cases: {"RAYS": 16, "SAMPLES": 64},
-    agreement: {"ROUNDS": 1, "STEPS": 2, "SCENE": ("dataset=bricks", "dataset.size=16", "dataset.train_views=10")},
-    speed: {"WARMUP": 2, "PERIODS": 1, "METHODS": ("hashgrid",), "BLOCKS": 4, "FIRST": 1, "BLOCK": 3},
-    cameras: {"STEPS": 2, "CONDITIONS": {"exact": cameras.CONDITIONS["exact"]}},
+    kernel_cases: {"NUM_RAYS": 16, "NUM_SAMPLES": 64},
+    agreement: {"TIMED_CALLS": 1, "STEPS": 2, "SCENE": ("dataset=bricks", "dataset.size=16", "dataset.train_views=10")},
+    step_time: {"WARMUP": 2, "PERIODS": 1, "METHODS": ("hashgrid",), "BLOCKS": 4, "FIRST": 1, "BLOCK": 3},
+    camera_noise: {"STEPS": 2, "CONDITIONS": {"exact": camera_noise.CONDITIONS["exact"]}},
     photos: {"SIZE": 16, "VIEWS": 6, "HELD_OUT": 2, "STEPS": 2},
-    pictures: {"KINDS": ("clouds",), "FIELDS": ("hashgrid2d",), "SIZE": 16, "LARGE": 16},
+    image_fields: {"KINDS": ("clouds",), "FIELDS": ("hashgrid2d",), "SIZE": 16, "LARGE": 16},
 }  # fmt: skip
 
 
@@ -89,10 +89,10 @@ def tiny(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.long
-def test_main_tiny_parts_write_table_and_json(tiny: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+def test_main_writes_table_and_json(tiny: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     size = ["dataset.size=16", "dataset.train_views=10", "sampler.update_every=2"]
     options = f"--experiments smoke_3d --budgets 0.2 --seeds 0 --device cpu --output {tmp_path}".split()
-    monkeypatch.setattr("sys.argv", ["benchmarks", "agreement", "speed", "methods", *size, *options])
+    monkeypatch.setattr("sys.argv", ["benchmarks", "agreement", "step_time", "methods", *size, *options])
     with pytest.raises(SystemExit) as stopped:
         command.main()
     assert capsys.readouterr().out.splitlines()[-1] == "all equal" and stopped.value.code == 0
@@ -110,10 +110,10 @@ def test_main_tiny_parts_write_table_and_json(tiny: None, tmp_path: Path, monkey
 def test_measure_tiny_scenes_and_pictures_give_rows(tiny: None, tmp_path: Path):
     save_npz(bricks(size=16, train_views=6, val_views=2), tmp_path / "scene.npz")
     words = f"--scenes {tmp_path / 'scene.npz'} --recipes hashgrid_medium --seeds 0 --output {tmp_path}".split()
-    args = command.parse([*words, "dataset.max_side=16", "budget.steps=2", "budget.seconds=null"])
-    found = pictures.measure(args)
+    args = command.parse_args([*words, "dataset.max_side=16", "budget.steps=2", "budget.seconds=null"])
+    found = image_fields.measure(args)
     assert {row["table"] for row in found} == {"pictures", "2D fields", "kinds of pictures"}
     assert [row["photos"] for row in photos.measure(args)][:2] == ["one size", "several sizes"]
     args.overrides = []
-    rows = cameras.measure(args)
+    rows = camera_noise.measure(args)
     assert [row["refine"] for row in rows] == ["none", "auto"] and all(row["degrees"] < 1e-3 for row in rows[:1])

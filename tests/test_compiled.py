@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.system.compiled import BACKEND, check_compiler
+from nerf_lightning.system.torch_compile import COMPILE_BACKEND, check_compiler
 from nerf_lightning.utils.device import CPU
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -37,15 +37,15 @@ def test_compiled_fields_and_training_match_plain_ones(tmp_path: Path):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("backend", "names"), [("aot_eager", ["hashgrid", "tensorf"]), (BACKEND, ["voxels"])])
+@pytest.mark.parametrize(("backend", "names"), [("aot_eager", ["hashgrid", "tensorf"]), (COMPILE_BACKEND, ["voxels"])])
 def test_compiled_other_fields_and_kernels_match_plain_ones(backend: str, names: list[str], tmp_path: Path):
     assert list(check_fields(tmp_path, backend, *names)["fields"]) == names
 
 
-def test_missing_compiler_is_one_line_and_writes_nothing(inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_missing_compiler_is_one_line_and_writes_nothing(run_cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(torch._inductor.config.cpp, "cxx", ("no_such_compiler",))
     with pytest.raises(InputError, match="config: compile: found true, but .*expected a C.. compiler.*compile=false"):
-        check_compiler(CPU, BACKEND)
-    code, _, err = inside("+experiment=smoke_2d", "device=cpu", "compile=true")
+        check_compiler(CPU, COMPILE_BACKEND)
+    code, _, err = run_cli("+experiment=smoke_2d", "device=cpu", "compile=true")
     assert code == 2 and err.count("\n") == 1 and "compile: found true, but" in err, err
     assert not list(tmp_path.rglob("*"))

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 from nerf_lightning.cli.app import main
-from nerf_lightning.export.photos import write_photos
+from nerf_lightning.export.transforms import write_photos
 from nerf_lightning.synthetic.bricks import bricks
-from nerf_lightning.utils.signals import Interrupted
+from nerf_lightning.utils.signals import SignalInterrupt
 from tests.helpers.command_line import BARE
-from tests.helpers.tag_views import SIZE
+from tests.helpers.tag_views import TAG_SIZE
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -34,9 +34,9 @@ PLAIN = " ".join(BARE)
 PICTURE = "dataset.max_side=16 dataset.pixels=64 budget.seconds=null budget.steps=2"
 SMALLER: list[tuple[str, str]] = [
     ("experiment=pareto", f"{SCENE} recipe=tensorf_small seed=0"),
-    ("experiment=study_grid", f"{PICTURE} {PLAIN} model.frequencies=1 model.width=16"),
-    ("experiment=study_frequencies", f"{PICTURE} {PLAIN} model.frequencies=2"),
-    ("experiment=study_rate", f"{PICTURE} {PLAIN} optimizer.lr=1e-1"),
+    ("experiment=study_grid", f"{PICTURE} {PLAIN} model.num_frequencies=1 model.width=16"),
+    ("experiment=study_frequencies", f"{PICTURE} {PLAIN} model.num_frequencies=2"),
+    ("experiment=study_lr", f"{PICTURE} {PLAIN} optimizer.lr=1e-1"),
     ("render.scale=2", "dataset.max_side=16 dataset.pixels=64 budget.steps=2"),
     ("experiment=capture", "dataset.rays=64 callbacks.orbit.frames=2 budget.steps=2 budget.seconds=null"),
     ("rightsize", f"{SCENE} --ladder ladder.yaml"),
@@ -45,10 +45,10 @@ SMALLER: list[tuple[str, str]] = [
     ("-m +experiment=picture", f"{PICTURE} {PLAIN}"),
     ("experiment=picture", PICTURE),
     ("model=ball", "dataset.size=16 dataset.train_views=4 dataset.val_views=1 budget.steps=2 callbacks.orbit.frames=2"),
-    ("capture --calibration", f"--tag-size {SIZE} --resize 60"),
+    ("capture --calibration", f"--tag-size {TAG_SIZE} --resize 60"),
     ("nerf_lightning render", "--frames 2"),
-    ("export compact", "--loss-db 100"),
-    ("export html", "--loss-db 100 --cells 16"),
+    ("export compact", "--max-psnr-drop 100"),
+    ("export html", "--max-psnr-drop 100 --cells 16"),
     ("export voxels", "--resolution 24"),
     ("export transforms", ""),
     ("nerf_lightning export", "--threshold 1e-3 --resolution 24"),
@@ -89,7 +89,7 @@ def shell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[
     from nerf_lightning.view.scene_page import ScenePage
 
     def leave(*_: Any) -> None:
-        raise Interrupted(signal.SIGINT)
+        raise SignalInterrupt(signal.SIGINT)
 
     monkeypatch.setattr(FieldPage, "run", leave)
     monkeypatch.setattr(ScenePage, "run", leave)

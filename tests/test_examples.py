@@ -13,8 +13,8 @@ from nbclient import NotebookClient
 
 from benchmarks.synthetic.photos import Truth
 from nerf_lightning.dataset import save_npz
-from nerf_lightning.synthetic.objects import PILE, make_scene
-from tests.helpers.tag_views import SIZE
+from nerf_lightning.synthetic.objects import PILE, make_object_scene
+from tests.helpers.tag_views import TAG_SIZE
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
@@ -35,7 +35,7 @@ def example(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., No
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
     path = tmp_path / "pile.npz"
-    save_npz(make_scene(PILE, size=16, views=8, held_out=2), path)
+    save_npz(make_object_scene(PILE, size=16, views=8, held_out=2), path)
     return path
 
 
@@ -57,10 +57,10 @@ def test_example_own_part_learns(
 
 
 def test_example_own_photos_writes_orbit_and_field(
-    example: Callable[..., None], made: tuple[Path, Truth], tmp_path: Path
+    example: Callable[..., None], tag_capture: tuple[Path, Truth], tmp_path: Path
 ):
-    folder, _ = made
-    given = [str(folder / "calibration"), str(folder / "photos"), "--tag", str(SIZE)]
+    folder, _ = tag_capture
+    given = [str(folder / "calibration"), str(folder / "photos"), "--tag", str(TAG_SIZE)]
     example("own_photos.py", *given, "--seconds", "0.5", "--pixels", "16")
     assert imageio.imread(tmp_path / "orbit.webp").shape == (12, 16, 3)
     assert (tmp_path / "field.npz").is_file()

@@ -9,13 +9,13 @@ from omegaconf import DictConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from nerf_lightning.config import conf_dir
-from nerf_lightning.config.build import build_data, build_system, frame_of
-from nerf_lightning.config.compose import composed
+from nerf_lightning.config.build import build_data, build_system, get_metadata
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.system import NeRF2D, NeRF3D, System
-from nerf_lightning.system.system import total_loss
+from nerf_lightning.system.system import sum_losses
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.seeding import Stream, step_generator
 from tests.helpers.command_line import BARE
@@ -32,26 +32,26 @@ def small_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_lego_mlp_follows_recipe_of_course(tmp_path: Path):
+def test_lego_mlp_matches_original_nerf(tmp_path: Path):
     """8 layers of 256 with the encoding again at the fifth, L = 10 and 4, Adam at 5e-4, 4096 rays of 64 samples."""
-    cfg = composed(["+experiment=lego_mlp"], tmp_path)
+    cfg = compose_config(["+experiment=lego_mlp"], tmp_path)
     model = {key: value for key, value in cfg.model.items() if key != "_target_"}
     assert model == {
         "depth": 8, "width": 256, "skip": 4, "position_frequencies": 10, "direction_frequencies": 4, "density": "relu",
     }  # fmt: skip
     assert (cfg.optimizer._target_, cfg.optimizer.lr) == ("torch.optim.Adam", 5e-4)
     assert (cfg.dataset.rays, cfg.dataset.samples, cfg.sampler.samples) == (4096, None, 64)
-    cfg = composed(["+experiment=picture_mlp"], tmp_path)
-    assert (cfg.dataset.pixels, cfg.optimizer.lr, cfg.model.frequencies, cfg.model.width) == (10_000, 1e-2, 10, 256)
+    cfg = compose_config(["+experiment=picture_mlp"], tmp_path)
+    assert (cfg.dataset.pixels, cfg.optimizer.lr, cfg.model.num_frequencies, cfg.model.width) == (10_000, 1e-2, 10, 256)
 
 
 def take_a_step(cfg: DictConfig) -> System:
     """Builds what a configuration describes, and trains it for one step."""
     data = build_data(cfg)
-    system = build_system(cfg, frame_of(data))
+    system = build_system(cfg, get_metadata(data))
     batch, optimizer = data.draw(0), system.configure_optimizers()
     if isinstance(system, NeRF3D):
-        loss = total_loss(system.compute_losses(batch, step_generator(0, Stream.STEP, 0))[0])
+        loss = sum_losses(system.compute_losses(batch, step_generator(0, Stream.STEP, 0))[0])
     else:
         assert isinstance(system, NeRF2D)
         loss = system.loss(batch)
@@ -70,7 +70,7 @@ def test_experiment_each_one_runs_as_a_whole(experiment: str, small_scene: Path,
         small = ["dataset.size=24"]
     else:
         small = [f"dataset.path={small_scene}", "dataset.resize=null", "dataset.rays=256", "callbacks.orbit.frames=2"]
-    train(composed([f"+experiment={experiment}", "trainer.fast_dev_run=true", *small], tmp_path))
+    train(compose_config([f"+experiment={experiment}", "trainer.fast_dev_run=true", *small], tmp_path))
     results = json.loads((tmp_path / "results.json").read_text())
     assert results["steps"] == 1
     assert results["psnr"] > 0
@@ -83,14 +83,16 @@ def test_experiment_each_one_runs_as_a_whole(experiment: str, small_scene: Path,
 def test_group_each_option_takes_a_step(group: str, option: str, small_scene: Path, tmp_path: Path):
     flat = option in ("picture_mlp", "hashgrid2d", "fourier", "siren")
     few = ["dataset=photos", f"dataset.path={small_scene}"] if not flat else ["dataset=picture", "dataset.max_side=16"]
-    cfg = composed([*few, *(() if flat or group == "recipe" else ("dataset.rays=64",)), f"{group}={option}"], tmp_path)
+    cfg = compose_config(
+        [*few, *(() if flat or group == "recipe" else ("dataset.rays=64",)), f"{group}={option}"], tmp_path
+    )
     assert group != "recipe" or (cfg.recipe == option and option.startswith(cfg.method))
     assert isinstance(take_a_step(cfg), NeRF2D) == flat
 
 
 def test_run_leaves_results_pictures_checkpoints_and_curves(tmp_path: Path):
     """Contract: results.json, pictures, checkpoints, curves and hyperparameters, in its folder, which can be moved."""
-    cfg = composed(["+experiment=smoke_3d", "budget.steps=60", "seed=3"], tmp_path)
+    cfg = compose_config(["+experiment=smoke_3d", "budget.steps=60", "seed=3"], tmp_path)
     quality = train(cfg)
     results = json.loads((tmp_path / "results.json").read_text())
     assert set(results) == {
@@ -124,4 +126,4 @@ def test_run_leaves_results_pictures_checkpoints_and_curves(tmp_path: Path):
     run = load_run(tmp_path.rename(tmp_path.parent / "moved"))
     saved = torch.load(tmp_path.parent / "moved" / "checkpoints" / "last.ckpt", weights_only=True)
     assert torch.equal(run.system.field.grid.tables, saved["state_dict"]["field.grid.tables"])
-    assert run.orbit is not None and run.system.render(run.orbit.view_rays(0)).rgb.std() > 0.01
+    assert run.orbit is not None and run.system.render(run.orbit.generate_view_rays(0)).rgb.std() > 0.01

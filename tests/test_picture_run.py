@@ -6,12 +6,12 @@ from pathlib import Path
 import imageio.v3 as imageio
 from PIL import Image
 
-from nerf_lightning.config.compose import composed
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.training.train import train
 
 
-def test_picture_run_writes_pictures_and_figures(own_cache: None, tmp_path: Path):
-    train(composed(["+experiment=picture", "dataset.max_side=24", "budget.steps=20", "render.scale=2"], tmp_path))
+def test_picture_run_writes_pictures_and_figures(isolated_cache: None, tmp_path: Path):
+    train(compose_config(["+experiment=picture", "dataset.max_side=24", "budget.steps=20", "render.scale=2"], tmp_path))
     assert {path.name for path in tmp_path.iterdir()} >= {
         "baselines.json", "checkpoints", "config.yaml", "curve.png", "enlarged.json", "enlarged.png",
         "enlarged_panel.png", "error.png", "final.png", "results.json", "snapshots", "spectrum.png", "training.gif",

@@ -23,10 +23,10 @@ from nerf_lightning.dataset import Views, open_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.compact import encode, load_compact
-from nerf_lightning.runs.folder import load_config, load_run, plain_config
+from nerf_lightning.runs.folder import config_to_dict, load_config, load_run
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.parsing import read_json, read_npy, read_yaml
-from tests.helpers.colmap_files import write_scene
+from tests.helpers.scene_writers import write_scene
 
 MAX_BYTES, MAX_SECONDS = 1 << 30, 10
 EXAMPLES = 20
@@ -61,7 +61,7 @@ READERS: dict[str, tuple[str, str, Reader]] = {
 
 
 @pytest.fixture(scope="session")
-def whole(tmp_path_factory: pytest.TempPathFactory, small_run: Path, own_cache: None) -> Path:
+def whole(tmp_path_factory: pytest.TempPathFactory, small_run: Path, isolated_cache: None) -> Path:
     """A valid file of each kind."""
     folder = tmp_path_factory.mktemp("readers")
     views: Views = bricks(size=8, train_views=5, val_views=1).train
@@ -71,7 +71,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, small_run: Path, own_cache: 
     (folder / "options.yaml").write_text(yaml.safe_dump({"a": {"b": [1, 2.5, None, "x"]}, "day": "2020-01-02"}))
     shutil.copytree(small_run, folder / "run")
     run = load_run(folder / "run")
-    (folder / "run" / "compact.npz").write_bytes(encode(run.system, "byte", plain_config(run.cfg), run.scene))
+    (folder / "run" / "compact.npz").write_bytes(encode(run.system, "byte", config_to_dict(run.cfg), run.scene))
     return folder
 
 
@@ -97,7 +97,7 @@ def damage(draw: st.DrawFn) -> Callable[[bytes], bytes]:
 
 
 @contextmanager
-def limited() -> Iterator[None]:
+def limit_memory() -> Iterator[None]:
     """Fails a block that allocates or lasts too much."""
 
     def expire(signum: int, frame: FrameType | None) -> None:
@@ -116,7 +116,7 @@ def limited() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_reader_reads_or_refuses_damaged_files(name: str, whole: Path):
+def test_readers_damaged_files_load_or_raise(name: str, whole: Path):
     damaged, source, read = READERS[name]
     good = (whole / damaged).read_bytes()
     read(whole / source)
@@ -129,7 +129,7 @@ def test_reader_reads_or_refuses_damaged_files(name: str, whole: Path):
             content = mutate(content or b"\0")
         (whole / damaged).write_bytes(content)
         try:
-            with limited():
+            with limit_memory():
                 read(whole / source)
         except InputError as error:
             assert "\n" not in str(error)
@@ -150,7 +150,7 @@ class Canary:
         return (Path.touch, (self.path,))
 
 
-def test_no_reader_executes_what_a_file_holds(whole: Path, tmp_path: Path):
+def test_readers_pickled_payload_is_never_executed(whole: Path, tmp_path: Path):
     canary = tmp_path / "executed"
     array = np.array([Canary(canary)], dtype=object)
     np.save(tmp_path / "a.npy", array, allow_pickle=True)

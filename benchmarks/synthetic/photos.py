@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from benchmarks.synthetic.tabletop import Tabletop
-from benchmarks.synthetic.viewpoints import object_cameras, sheet_cameras
-from nerf_lightning.capture.poses.geometry import normalised
-from nerf_lightning.capture.tags.layout import TagLayout
+from benchmarks.synthetic.viewpoints import make_object_cameras, make_sheet_cameras
+from nerf_lightning.capture.poses.geometry import normalize_pixels
+from nerf_lightning.capture.tags.tag_layout import TagLayout
 from nerf_lightning.dataset.intrinsics import Intrinsics
-from nerf_lightning.synthetic.tracer import map_shadow
+from nerf_lightning.synthetic.tracer import render_shadow_map
 
 BLOCK = 32
 """Side of the blocks in pixels that are traced at once: as many rays as stay in a core's cache."""
@@ -72,7 +72,7 @@ def render_photo(
     """
     tabletop = Tabletop(layout, hidden)
     exact = np.empty((lens.height, lens.width, 3), np.float32)
-    grid = _tangents(lens, samples)
+    grid = _compute_tangents(lens, samples)
     for top in range(0, lens.height, BLOCK):
         for left in range(0, lens.width, BLOCK):
             block = np.s_[top : top + BLOCK, left : left + BLOCK]
@@ -88,7 +88,7 @@ def render_photo(
 
 
 @functools.lru_cache(maxsize=1)
-def _tangents(lens: Intrinsics, n: int) -> Float[np.ndarray, "H W S 2"]:
+def _compute_tangents(lens: Intrinsics, n: int) -> Float[np.ndarray, "H W S 2"]:
     """x / z and y / z of all samples in the camera frame; kept, because undoing the distortion takes as long as a photo.
 
     The samples of a pixel form a grid that is sheared both ways, so that no two share a row or a column: edges along the
@@ -98,7 +98,7 @@ def _tangents(lens: Intrinsics, n: int) -> Float[np.ndarray, "H W S 2"]:
     col, row = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
     x, y = col[..., None] + (i + (j + 0.5) / n) / n, row[..., None] + (j + (n - i - 0.5) / n) / n
     pixels = np.stack([x, y], axis=-1)
-    lines = [normalised(lens, line.reshape(-1, 2)).astype(np.float32) for line in pixels]
+    lines = [normalize_pixels(lens, line.reshape(-1, 2)).astype(np.float32) for line in pixels]
     return np.stack(lines).reshape(pixels.shape)
 
 
@@ -126,12 +126,12 @@ def write_capture(
         samples: see `render_photo`.
         hide: in every N-th photo of the object, from the second on, the tags are hidden; None: in none.
     """
-    _tangents(lens, samples)  # made once, before the threads ask for it, and so is the shadow
-    map_shadow()
+    _compute_tangents(lens, samples)  # made once, before the threads ask for it, and so is the shadow
+    render_shadow_map()
     seeds = iter(np.random.SeedSequence(seed).generate_state(2 + sheet_views + object_views).tolist())
     poses = {
-        "calibration": sheet_cameras(layout, lens, sheet_views, next(seeds)),
-        "photos": object_cameras(layout, lens, object_views, next(seeds), steps),
+        "calibration": make_sheet_cameras(layout, lens, sheet_views, next(seeds)),
+        "photos": make_object_cameras(layout, lens, object_views, next(seeds), steps),
     }
     named = {kind: {f"{i:03d}.png": c2w for i, c2w in enumerate(c2ws)} for kind, c2ws in poses.items()}
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import Scene
 from nerf_lightning.synthetic.objects import trace_rays
-from nerf_lightning.synthetic.rooms import Room, photograph_room, place_handheld
+from nerf_lightning.synthetic.rooms import Room, make_handheld_cameras, render_room
 
 WIDTH, HEIGHT, VIEWS = 240, 180, 56
 
@@ -19,8 +19,8 @@ WIDTH, HEIGHT, VIEWS = 240, 180, 56
 def write_room(room: Room, folder: Path, seed: int = 0) -> None:
     """Writes photos and a transforms.json."""
     (folder / "images").mkdir(parents=True)
-    cameras, frames = place_handheld(VIEWS, WIDTH, HEIGHT, seed), []
-    photos = photograph_room(room, cameras).images.numpy()
+    cameras, frames = make_handheld_cameras(VIEWS, WIDTH, HEIGHT, seed), []
+    photos = render_room(room, cameras).images.numpy()
     for view in range(VIEWS):
         name = f"images/{view:03d}.png"
         imageio.imwrite(folder / name, photos[view])
@@ -31,11 +31,11 @@ def write_room(room: Room, folder: Path, seed: int = 0) -> None:
     (folder / "transforms.json").write_text(json.dumps({**lens, "w": WIDTH, "h": HEIGHT, "frames": frames}))
 
 
-def true_view(room: Room, scene: Scene, view: int) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
+def render_true_view(room: Room, scene: Scene, view: int) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
     """Distance of what the rays of a held-out view meet, scene's unit, and the body's number."""
-    rays, to_source = scene.val.cameras.view_rays(view), scene.to_source
+    rays, to_source = scene.val.cameras.generate_view_rays(view), scene.to_source
     scale = float(torch.linalg.det(to_source[:3, :3])) ** (1 / 3)
     turn, shift = to_source[:3, :3].to(rays.origins), to_source[:3, 3].to(rays.origins)
     there = Rays(rays.origins @ turn.mT + shift, rays.directions @ turn.mT / scale)
-    _, distance, which = trace_rays(room.bodies, there)
+    _, distance, which = trace_rays(room.primitives, there)
     return distance / scale, which

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt8
 
 from benchmarks.synthetic.tabletop import Tabletop
 from nerf_lightning.cameras import look_at
-from nerf_lightning.capture.tags.layout import TagLayout
+from nerf_lightning.capture.tags.tag_layout import TagLayout
 from nerf_lightning.dataset.intrinsics import Intrinsics
 
 CRF = 20
@@ -34,7 +34,7 @@ def place_cameras(layout: TagLayout, lens: Intrinsics, count: int) -> Float[np.n
     return look_at(torch.from_numpy(eye), torch.from_numpy(centre), up).numpy()
 
 
-def blurred(
+def blur_image(
     picture: UInt8[np.ndarray, "H W 3"], pixels: float, angle: float | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
     """A picture blurred by a Gaussian of a standard deviation in pixels, or along a line that long at an angle (radians)."""
@@ -55,7 +55,7 @@ BLURS = ((0.5, False), (0.7, False), (1.0, False), (2.0, False), (1.5, True), (2
 """Pixels, and whether along a line; the weakest can hardly be seen."""
 
 
-def with_blurs(
+def blur_images(
     pictures: Iterable[UInt8[np.ndarray, "H W 3"]], seed: int, every: int = 3
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
     """Pictures of which each `every`-th is blurred, from the second on, by each of `BLURS` in turn, along random lines."""
@@ -63,7 +63,7 @@ def with_blurs(
     for index, picture in enumerate(pictures):
         pixels, line = BLURS[index // every % len(BLURS)]
         angle = float(rng.uniform(0, np.pi)) if line else None
-        yield blurred(picture, pixels, angle) if index % every == 1 else picture
+        yield blur_image(picture, pixels, angle) if index % every == 1 else picture
 
 
 def write_video(file: Path, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], quarter_turns: int = 0) -> None:
@@ -83,10 +83,10 @@ def write_video(file: Path, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], quar
             container.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         container.mux(stream.encode(None))
     if quarter_turns:
-        _flag(file, quarter_turns)
+        _write_rotation(file, quarter_turns)
 
 
-def _flag(file: Path, quarter_turns: int) -> None:
+def _write_rotation(file: Path, quarter_turns: int) -> None:
     """Writes the rotation into the track header, which no option reaches: a matrix of 16.16 numbers (ISO 14496-12)."""
     data = bytearray(file.read_bytes())
     at = data.index(b"tkhd") + 4 + 40

@@ -7,26 +7,26 @@ from typing import Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import agreed, attached, data_of
-from nerf_lightning.callbacks.plateau import Plateau
-from nerf_lightning.callbacks.render_plan import MIN_SECONDS, PROBE_PIXELS, RenderPlan, allot
-from nerf_lightning.dataset.subset import thin
+from nerf_lightning.callbacks.early_stopping import PlateauDetector
+from nerf_lightning.callbacks.render_timer import MIN_RENDER_SECONDS, PROBE_PIXELS, RenderTimer, allocate_max_min_fair
+from nerf_lightning.callbacks.trainer_access import broadcast_from_rank_zero, find_callback, get_datamodule
+from nerf_lightning.dataset.pixel_subset import make_subset
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System, TrainingState
-from nerf_lightning.utils.options import Count, Positive
+from nerf_lightning.utils.option_checks import Count, PositiveFloat
 from nerf_lightning.utils.signals import defer_signals
 from nerf_lightning.utils.text import subsample
 
-LOOK_AT, LOOK_PIXELS = 3, 1 << 16
+MAX_PLATEAU_VIEWS, MAX_PLATEAU_PIXELS = 3, 1 << 16
 """Held-out views rendered to look for a plateau, and about the most pixels of each."""
-COOLING = 0.15
+COOLDOWN_FRACTION = 0.15
 """Cooling down after a plateau takes this share of what was spent up to it."""
 
 
 class Budget(L.Callback):
     """Stops training when the budget is spent, or no longer worth spending, and tells the system its progress.
 
-    Training time is the wall clock from the first step on, less what runs inside `paused()` (evaluation, pictures). With
+    Training time is the wall clock from the first step on, less what runs inside `pause()` (evaluation, pictures). With
     both limits, the first one reached ends the run.
 
     With `patience`, a few held-out views are rendered from time to time, with the clock stopped. When their quality reaches a
@@ -45,27 +45,27 @@ class Budget(L.Callback):
     def __init__(
         self,
         steps: Count | None = None,
-        seconds: Positive | None = None,
-        patience: Positive | None = None,
+        seconds: PositiveFloat | None = None,
+        patience: PositiveFloat | None = None,
     ):
         if steps is None and seconds is None:
             raise InputError("budget", "", "neither steps nor seconds", "budget.steps=N or budget.seconds=S")
         self.steps = steps
-        self.limit_seconds = seconds
-        self.plateau = Plateau(patience) if patience is not None else None
+        self.max_seconds = seconds
+        self.plateau_detector = PlateauDetector(patience) if patience is not None else None
         self.state = TrainingState()
         """The system's, from `setup` on."""
-        self.stopped: dict[str, float] | None = None
+        self.final_plateau: dict[str, float] | None = None
         """The plateau that ends the run: its `seconds` and `step`, and `rest_db`, what the rest of the budget would add."""
-        self._line = (0.0, 0.0, 1.0)
+        self._progress_line = (0.0, 0.0, 1.0)
         """Progress is a line over the share spent: (start, progress there, slope)."""
-        self.plan = RenderPlan()
+        self.render_timer = RenderTimer()
         """Of what is rendered beside training."""
 
     @staticmethod
-    def of(trainer: L.Trainer) -> "Budget":
+    def find(trainer: L.Trainer) -> "Budget":
         """The trainer's budget."""
-        budget = attached(trainer, Budget)
+        budget = find_callback(trainer, Budget)
         if budget is None:
             raise RuntimeError("a trainer needs a Budget among its callbacks; build_trainer puts one there")
         return budget
@@ -75,127 +75,139 @@ class Budget(L.Callback):
         """Seconds trained so far."""
         return self.state.clock.seconds
 
-    def spent(self, step: int) -> float:
+    def spent_fraction(self, step: int) -> float:
         """Fraction of the limits spent after `step` steps."""
         by_steps = step / self.steps if self.steps is not None else 0.0
-        return max(by_steps, self.seconds / self.limit_seconds if self.limit_seconds is not None else 0.0)
+        return max(by_steps, self.seconds / self.max_seconds if self.max_seconds is not None else 0.0)
 
     def progress(self, step: int) -> float:
         """Share of the training done after `step` steps, in [0, 1]: that of the limits spent, until there is a plateau."""
-        spent = self.spent(step)
-        start, reached, slope = self._line
+        spent = self.spent_fraction(step)
+        start, reached, slope = self._progress_line
         return min(1.0, max(spent, reached + slope * (spent - start)))
 
-    def render_seconds(self, step: int) -> float:
+    def render_allowance_seconds(self, step: int) -> float:
         """Seconds that rendering beside training may take: as long as training is expected to take, judged after `step` steps,
-        and at least `MIN_SECONDS`."""
-        return max(MIN_SECONDS, self.seconds + (self.seconds_left(step) or 0.0))
+        and at least `MIN_RENDER_SECONDS`."""
+        return max(MIN_RENDER_SECONDS, self.seconds + (self.seconds_left(step) or 0.0))
 
     def seconds_left(self, step: int) -> float | None:
         """Seconds of training still to come, judged after `step` steps; None before the first."""
-        spent = self.spent(step)
-        start, reached, slope = self._line
+        spent = self.spent_fraction(step)
+        start, reached, slope = self._progress_line
         end = min(1.0, start + (1 - reached) / slope)
         return max(0.0, end - spent) * self.seconds / spent if spent else None
 
-    def paused(self) -> AbstractContextManager[None]:
+    def pause(self) -> AbstractContextManager[None]:
         """Stops the clock for work that is not training."""
-        return self.state.clock.paused()
+        return self.state.clock.pause()
 
     @contextmanager
-    def rendering(self, trainer: L.Trainer, subject: str) -> Iterator[None]:
+    def pause_to_render(self, trainer: L.Trainer, subject: str) -> Iterator[None]:
         """Stops the clock for a block that renders, which a signal ends: it must change nothing that a checkpoint keeps."""
-        alone = trainer.world_size == 1  # several processes leave together, at the end of a step
-        with self.paused(), self.plan.rendering(subject), defer_signals(False) if alone else nullcontext():
+        is_single_process = trainer.world_size == 1  # several processes leave together, at the end of a step
+        with (
+            self.pause(),
+            self.render_timer.measure(subject),
+            defer_signals(False) if is_single_process else nullcontext(),
+        ):
             yield
 
-    def shared_progress(self, trainer: L.Trainer) -> float:
+    def sync_progress(self, trainer: L.Trainer) -> float:
         """`progress`, the same in all processes of a run."""
         progress = self.progress(trainer.global_step)
-        return progress if self.limit_seconds is None else agreed(trainer, progress)
+        return progress if self.max_seconds is None else broadcast_from_rank_zero(trainer, progress)
 
     def setup(self, trainer: L.Trainer, pl_module: System, stage: str) -> None:
         self.state = pl_module.state
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         # A finished run that is resumed has nothing left to do.
-        trainer.should_stop = self.shared_progress(trainer) >= 1.0
+        trainer.should_stop = self.sync_progress(trainer) >= 1.0
         self.state.clock.start(pl_module.device)
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        self.state.advance(self.shared_progress(trainer))
+        self.state.set_progress(self.sync_progress(trainer))
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        self.state.advance(self.shared_progress(trainer))
-        if self.plateau is not None and self.stopped is None and self.state.progress < 1.0:
-            self._look_for_plateau(trainer, pl_module, self.plateau)
+        self.state.set_progress(self.sync_progress(trainer))
+        if self.plateau_detector is not None and self.final_plateau is None and self.state.progress < 1.0:
+            self._check_plateau(trainer, pl_module, self.plateau_detector)
         if self.state.progress >= 1.0:
             trainer.should_stop = True
 
-    def _look_for_plateau(self, trainer: L.Trainer, system: System, plateau: Plateau) -> None:
+    def _check_plateau(self, trainer: L.Trainer, system: System, plateau: PlateauDetector) -> None:
         step = trainer.global_step
-        spent = agreed(trainer, self.spent(step))
-        if not plateau.due(spent):
+        spent = broadcast_from_rank_zero(trainer, self.spent_fraction(step))
+        if not plateau.is_due(spent):
             return
-        data = data_of(trainer)
-        chosen = subsample(data.held_out_views, LOOK_AT)
-        some = thin(max(map(data.pixels_held_out, chosen)), LOOK_PIXELS)
-        with self.rendering(trainer, "views to look for a plateau"):
-            quality = fmean(view.psnr for view in system.evaluate_held_out(data, chosen, some))
-        if not agreed(trainer, plateau.note(spent, quality)):
+        data = get_datamodule(trainer)
+        chosen = subsample(data.num_held_out_views, MAX_PLATEAU_VIEWS)
+        some = make_subset(max(map(data.count_held_out_pixels, chosen)), MAX_PLATEAU_PIXELS)
+        with self.pause_to_render(trainer, "views to look for a plateau"):
+            psnr = fmean(view.psnr for view in system.evaluate_held_out(data, chosen, some))
+        if not broadcast_from_rank_zero(trainer, plateau.add_measurement(spent, psnr)):
             return
         growth = system.field.growth
         if growth is not None and self.state.progress < growth.end:
-            self._line = (spent, growth.end, (1 - growth.end) / (1 - spent))
-            plateau.start()
+            self._progress_line = (spent, growth.end, (1 - growth.end) / (1 - spent))
+            plateau.reset_trend()
             return
-        rest = plateau.gain(1 / spent) or 0.0
-        self._line = (spent, self.state.progress, (1 - self.state.progress) / (COOLING * spent))
-        self.stopped = {"seconds": round(self.seconds, 3), "step": step, "rest_db": round(rest, 3)}
+        remaining_gain_db = plateau.predict_gain(1 / spent) or 0.0
+        self._progress_line = (spent, self.state.progress, (1 - self.state.progress) / (COOLDOWN_FRACTION * spent))
+        self.final_plateau = {"seconds": round(self.seconds, 3), "step": step, "rest_db": round(remaining_gain_db, 3)}
         print(
-            f"budget: plateau after {self.seconds:.1f} s: the rest would bring {rest:.2f} dB; cooling down", flush=True
+            f"budget: plateau after {self.seconds:.1f} s: the rest would bring {remaining_gain_db:.2f} dB; cooling down",
+            flush=True,
         )
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
         self.state.clock.stop()
 
     def state_dict(self) -> dict[str, Any]:
-        plateau = None if self.plateau is None else self.plateau.state
-        return {"seconds": self.seconds, "line": self._line, "stopped": self.stopped, "plateau": plateau}
+        plateau = None if self.plateau_detector is None else self.plateau_detector.state
+        return {
+            "seconds": self.seconds,
+            "line": self._progress_line,
+            "final_plateau": self.final_plateau,
+            "plateau": plateau,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._line, self.stopped = state_dict["line"], state_dict["stopped"]
+        self._progress_line, self.final_plateau = state_dict["line"], state_dict["final_plateau"]
         self.state.clock.set_seconds(state_dict["seconds"])
-        if self.plateau is not None and state_dict["plateau"] is not None:
-            self.plateau.state = state_dict["plateau"]
+        if self.plateau_detector is not None and state_dict["plateau"] is not None:
+            self.plateau_detector.state = state_dict["plateau"]
 
 
-class Renders(L.Callback):
+class RenderingCallback(L.Callback):
     """A callback that renders views, in the time that the run has for them."""
 
     weight = 1.0
     """Of its time, where there is not enough for all."""
 
-    def pixels_left(self, trainer: L.Trainer) -> float:
+    def count_remaining_pixels(self, trainer: L.Trainer) -> float:
         """Pixels that are still to be rendered, where there is time for all."""
-        raise TypeError(f"{type(self).__name__} must define pixels_left(trainer)")
+        raise TypeError(f"{type(self).__name__} must define count_remaining_pixels(trainer)")
 
-    def share(self, trainer: L.Trainer, system: System, pixels: float | None = None) -> float:
+    def compute_affordable_fraction(self, trainer: L.Trainer, system: System, pixels: float | None = None) -> float:
         """The share of so many pixels for which there is time; None takes all that are left."""
-        plan, data = Budget.of(trainer).plan, data_of(trainer)
-        if plan.pixel_seconds is None:
-            some = thin(data.pixels_held_out(0), PROBE_PIXELS)
-            with Budget.of(trainer).rendering(trainer, "a first look"):
+        render_timer, data = Budget.find(trainer).render_timer, get_datamodule(trainer)
+        if render_timer.seconds_per_pixel is None:
+            some = make_subset(data.count_held_out_pixels(0), PROBE_PIXELS)
+            with Budget.find(trainer).pause_to_render(trainer, "a first look"):
                 (view,) = system.evaluate_held_out(data, [0], some)
-            plan.note(view.pixels, view.seconds)
-        cost = (self.pixels_left(trainer) if pixels is None else pixels) * (plan.pixel_seconds or 0.0)
-        return min(1.0, render_seconds(trainer)[self] / cost) if cost else 1.0
+            render_timer.add_timing(view.num_pixels, view.seconds)
+        cost = (self.count_remaining_pixels(trainer) if pixels is None else pixels) * (
+            render_timer.seconds_per_pixel or 0.0
+        )
+        return min(1.0, allocate_render_seconds(trainer)[self] / cost) if cost else 1.0
 
 
-def render_seconds(trainer: L.Trainer) -> dict[Renders, float]:
+def allocate_render_seconds(trainer: L.Trainer) -> dict[RenderingCallback, float]:
     """Seconds that each callback may still render; 0 before the first view."""
-    budget = Budget.of(trainer)
-    jobs = [one for one in trainer.callbacks if isinstance(one, Renders)]  # type: ignore[attr-defined]
-    costs = {one: one.pixels_left(trainer) * (budget.plan.pixel_seconds or 0.0) for one in jobs}
-    allowance = budget.render_seconds(trainer.global_step) - budget.plan.spent
-    return allot(costs, {one: one.weight for one in jobs}, allowance)
+    budget = Budget.find(trainer)
+    jobs = [one for one in trainer.callbacks if isinstance(one, RenderingCallback)]  # type: ignore[attr-defined]
+    costs = {one: one.count_remaining_pixels(trainer) * (budget.render_timer.seconds_per_pixel or 0.0) for one in jobs}
+    allowance = budget.render_allowance_seconds(trainer.global_step) - budget.render_timer.seconds
+    return allocate_max_min_fair(costs, {one: one.weight for one in jobs}, allowance)

@@ -34,10 +34,10 @@ class LossHistory:
     start_step: int = 0
     ema_loss: float | None = None
     """The loss, averaged over the last steps; not finite once a loss was not."""
-    checks: list[float] = field(default_factory=list)
+    check_losses: list[float] = field(default_factory=list)
     """The same, at the checks within the last `patience` steps."""
-    lowest: float = math.inf
-    num_dead: int = 0
+    min_loss: float = math.inf
+    num_dead_checks: int = 0
     """Checks in a row at which no gradient came back."""
 
 
@@ -47,13 +47,13 @@ class LossMonitor:
     Args:
         every: steps between checks.
         patience: steps within which the loss must fall below that of a plain colour, or at least fall.
-        plain_loss: the loss of one plain colour.
+        constant_color_loss: the loss of one plain colour.
     """
 
-    def __init__(self, every: int, patience: int, plain_loss: float = 0.0):
+    def __init__(self, every: int, patience: int, constant_color_loss: float = 0.0):
         self.every = every
         self.patience = patience
-        self.plain_loss = plain_loss
+        self.constant_color_loss = constant_color_loss
         self.history = LossHistory()
 
     def reset(self, start_step: int | None = None) -> None:
@@ -68,22 +68,22 @@ class LossMonitor:
     def has_learned(self) -> bool:
         """Whether the field has learned more than one plain colour."""
         loss = self.history.ema_loss
-        return loss is not None and loss < LEARNED_RATIO * self.plain_loss
+        return loss is not None and loss < LEARNED_RATIO * self.constant_color_loss
 
     @property
     def is_healthy(self) -> bool:
         """Whether the field has learned something, and is not losing it: its weights are worth keeping."""
         loss = self.history.ema_loss
-        return self.has_learned and loss is not None and loss <= DIVERGED_RATIO * self.history.lowest
+        return self.has_learned and loss is not None and loss <= DIVERGED_RATIO * self.history.min_loss
 
     def add_loss(self, loss: float) -> None:
         """Adds a step's squared error."""
         mean = self.history.ema_loss
         self.history.ema_loss = loss if mean is None else EMA_DECAY * mean + (1 - EMA_DECAY) * loss
 
-    def add_gradient(self, alive: bool) -> None:
+    def add_gradient(self, has_gradient: bool) -> None:
         """Adds whether any gradient came back, at a check before the field has begun to learn."""
-        self.history.num_dead = 0 if alive else self.history.num_dead + 1
+        self.history.num_dead_checks = 0 if has_gradient else self.history.num_dead_checks + 1
 
     def check(self, step: int, opacity: float | None) -> TrainingFailure | None:
         """Judges training at a step; None if it may go on.
@@ -96,42 +96,44 @@ class LossMonitor:
         if loss is None:
             return None
         window = self.patience // self.every + 2
-        history.checks = [*history.checks, loss][-window:]
-        has_waited = len(history.checks) == window and step - history.start_step >= self.patience
-        if cause := self._divergence_cause(loss, has_waited):
+        history.check_losses = [*history.check_losses, loss][-window:]
+        is_window_full = len(history.check_losses) == window and step - history.start_step >= self.patience
+        if cause := self._divergence_cause(loss, is_window_full):
             return TrainingFailure(cause, True)
-        if cause := self._stall_cause(loss, has_waited, opacity):
+        if cause := self._stall_cause(loss, is_window_full, opacity):
             return TrainingFailure(cause, False)
-        history.lowest = min(history.lowest, loss)
+        history.min_loss = min(history.min_loss, loss)
         return None
 
-    def _divergence_cause(self, loss: float, has_waited: bool) -> str:
+    def _divergence_cause(self, loss: float, is_window_full: bool) -> str:
         """How what was learned is being lost; "" if it is not."""
-        checks, lowest = self.history.checks, self.history.lowest
-        recent = checks[-DIVERGED_CHECKS:]
-        has_risen = len(recent) == DIVERGED_CHECKS and min(recent) > DIVERGED_RATIO * lowest
+        check_losses, min_loss = self.history.check_losses, self.history.min_loss
+        recent = check_losses[-DIVERGED_CHECKS:]
+        has_risen = len(recent) == DIVERGED_CHECKS and min(recent) > DIVERGED_RATIO * min_loss
         # A short spike, which falls again, does not matter.
-        if lowest < LEARNED_RATIO * self.plain_loss and has_risen and loss > STALL_RATIO * recent[0]:
-            return f"the loss rose to {loss / lowest:.0f} times its lowest"
-        if has_waited and min(checks[1:]) > max(WORSE_RATIO * lowest, HALF_LEARNED_RATIO * self.plain_loss):
-            share = lowest / self.plain_loss
+        if min_loss < LEARNED_RATIO * self.constant_color_loss and has_risen and loss > STALL_RATIO * recent[0]:
+            return f"the loss rose to {loss / min_loss:.0f} times its lowest"
+        if is_window_full and min(check_losses[1:]) > max(
+            WORSE_RATIO * min_loss, HALF_LEARNED_RATIO * self.constant_color_loss
+        ):
+            share = min_loss / self.constant_color_loss
             return f"the loss fell to {share:.2f} times that of one plain colour, and has stayed above that since"
         return ""
 
-    def _stall_cause(self, loss: float, has_waited: bool, opacity: float | None) -> str:
+    def _stall_cause(self, loss: float, is_window_full: bool, opacity: float | None) -> str:
         """Why nothing is being learned; "" if something is, or training has only just begun."""
-        if self.has_learned or not self.plain_loss:
+        if self.has_learned or not self.constant_color_loss:
             return ""  # a scene of one colour is learned as soon as its colour is
-        checks = self.history.checks
-        if self.history.num_dead < 2:  # without a gradient, waiting does not help
-            is_falling = all(after < before for before, after in pairwise(checks))
-            enough = SLOW_RATIO if loss > self.plain_loss and not is_falling else STALL_RATIO
-            if not has_waited or loss < enough * checks[0]:
+        check_losses = self.history.check_losses
+        if self.history.num_dead_checks < 2:  # without a gradient, waiting does not help
+            is_falling = all(after < before for before, after in pairwise(check_losses))
+            enough = SLOW_RATIO if loss > self.constant_color_loss and not is_falling else STALL_RATIO
+            if not is_window_full or loss < enough * check_losses[0]:
                 return ""
-        stuck = f"the loss stands at {loss / self.plain_loss:.2f} times that of one plain colour"
+        stuck = f"the loss stands at {loss / self.constant_color_loss:.2f} times that of one plain colour"
         if opacity is not None and opacity < EMPTY_OPACITY:
             return f"there is no density anywhere, so no gradient comes back; {stuck}"
-        if self.history.num_dead:
+        if self.history.num_dead_checks:
             return f"no gradient reaches any weight; {stuck}"
         if opacity is not None and opacity > FULL_OPACITY:
             return f"there is density everywhere, a wall before every camera; {stuck}"

@@ -10,65 +10,70 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from nerf_lightning.callbacks.attached import data_of
-from nerf_lightning.callbacks.budget import Budget, Renders
+from nerf_lightning.callbacks.budget import Budget, RenderingCallback
+from nerf_lightning.callbacks.trainer_access import get_datamodule
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.drawing.panels import panel, to_bytes, write_animation
+from nerf_lightning.drawing.panels import make_panel, to_uint8, write_animation
 from nerf_lightning.system import NeRF3D
-from nerf_lightning.utils.files import atomic
-from nerf_lightning.utils.options import AtLeast, FramesPerSecond
+from nerf_lightning.utils.files import atomic_write
+from nerf_lightning.utils.option_checks import FramesPerSecond, Ge
 from nerf_lightning.utils.text import subsample
 
-FILE = "orbit.gif"
+ORBIT_FILE = "orbit.gif"
 """Below the run folder."""
-MAX_SIDE = 800
+MAX_FRAME_SIDE = 800
 """Longer one of a frame, in pixels."""
 
 
-class Orbit(Renders):
+class Orbit(RenderingCallback):
     """Renders the scene's orbit after the test.
 
     Args:
-        frames: how many of the orbit's views, evenly chosen, of at most `MAX_SIDE` pixels, or smaller where there is not time
-            for them (see `Renders`); 0 makes no GIF.
+        frames: how many of the orbit's views, evenly chosen, of at most `MAX_FRAME_SIDE` pixels, or smaller if there is no time
+            for them (see `RenderingCallback`); 0 makes no GIF.
         fps: frames a second.
     """
 
-    def __init__(self, frames: Annotated[int, AtLeast(0)] = 60, fps: FramesPerSecond = 20):
+    def __init__(self, frames: Annotated[int, Ge(0)] = 60, fps: FramesPerSecond = 20):
         self.frames = frames
         self.fps = fps
-        self._done = 0.0  # share of the frames
+        self._done_fraction = 0.0  # share of the frames
 
-    def pixels_left(self, trainer: L.Trainer) -> float:
-        return float(self.cameras(trainer).sizes.prod(1).sum()) * (1 - self._done)
+    def count_remaining_pixels(self, trainer: L.Trainer) -> float:
+        return float(self.select_cameras(trainer).sizes.prod(1).sum()) * (1 - self._done_fraction)
 
-    def cameras(self, trainer: L.Trainer) -> Cameras:
+    def select_cameras(self, trainer: L.Trainer) -> Cameras:
         """Of the frames, at the size for which there may be time."""
-        orbit = data_of(trainer).scene.orbit
+        orbit = get_datamodule(trainer).scene.orbit
         chosen = orbit[torch.tensor(subsample(len(orbit), self.frames)).long()]
-        return chosen.scaled(min(1.0, MAX_SIDE / orbit.longest))
+        return chosen.rescale(min(1.0, MAX_FRAME_SIDE / orbit.max_side))
 
     def on_test_end(self, trainer: L.Trainer, pl_module: NeRF3D) -> None:
         if self.frames == 0 or not trainer.is_global_zero:
             return
-        full = self.cameras(trainer)
-        scale = math.sqrt(self.share(trainer, pl_module))
-        cameras = full.scaled(scale).to(pl_module.device)
+        full = self.select_cameras(trainer)
+        scale = math.sqrt(self.compute_affordable_fraction(trainer, pl_module))
+        cameras = full.rescale(scale).to(pl_module.device)
         if scale < 1:
             size = f"{len(full)} frames of {cameras.width}x{cameras.height}"
             print(
-                f"{FILE}: {size}, so that rendering takes no longer than training; nerf_lightning render takes any size"
+                f"{ORBIT_FILE}: {size}, so that rendering takes no longer than training; nerf_lightning render takes any size"
             )
-        with atomic(Path(trainer.default_root_dir) / FILE) as temporary:
-            write_animation(temporary, self._draw(trainer, pl_module, cameras), 1 / self.fps)
+        with atomic_write(Path(trainer.default_root_dir) / ORBIT_FILE) as temporary:
+            write_animation(temporary, self._render_frames(trainer, pl_module, cameras), 1 / self.fps)
 
-    def _draw(self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-        plan, caption = Budget.of(trainer).plan, f"{data_of(trainer).scene.name}, step {trainer.global_step}"
+    def _render_frames(
+        self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras
+    ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        render_timer, caption = (
+            Budget.find(trainer).render_timer,
+            f"{get_datamodule(trainer).scene.name}, step {trainer.global_step}",
+        )
         for view in range(len(cameras)):
-            before = plan.spent
-            with plan.rendering(f"orbit, frame {view + 1} of {len(cameras)}"):
-                rgb = system.render(cameras.view_rays(view)).rgb
-                image = to_bytes(rgb.view(cameras.height, cameras.width, 3))
-            plan.note(len(rgb), plan.spent - before)
-            self._done = (view + 1) / len(cameras)
-            yield panel([image], caption)
+            before = render_timer.seconds
+            with render_timer.measure(f"orbit, frame {view + 1} of {len(cameras)}"):
+                rgb = system.render(cameras.generate_view_rays(view)).rgb
+                image = to_uint8(rgb.view(cameras.height, cameras.width, 3))
+            render_timer.add_timing(len(rgb), render_timer.seconds - before)
+            self._done_fraction = (view + 1) / len(cameras)
+            yield make_panel([image], caption)

@@ -6,25 +6,25 @@ from typing import Any
 
 import lightning as L
 
-from nerf_lightning.callbacks.attached import data_of
-from nerf_lightning.callbacks.budget import Budget, Renders
+from nerf_lightning.callbacks.budget import Budget, RenderingCallback
+from nerf_lightning.callbacks.trainer_access import get_datamodule
 from nerf_lightning.dataset import DataModule
-from nerf_lightning.dataset.subset import thin
-from nerf_lightning.drawing.panels import narrowed, result_panel, to_bytes, write_png
+from nerf_lightning.dataset.pixel_subset import make_subset
+from nerf_lightning.drawing.panels import limit_width, make_result_panel, to_uint8, write_png
 from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.option_checks import Count
 
-LOGGED_WIDTH = 640
+MAX_LOGGED_WIDTH = 640
 """Widest picture for TensorBoard, in pixels: it takes 0.1 s for each megabyte."""
-FOLDER, FINAL, TRUTH = "snapshots", "final.png", "truth.png"
+SNAPSHOT_FOLDER, FINAL_FILE, TRUTH_FILE = "snapshots", "final.png", "truth.png"
 """Below the run folder: all snapshots, the latest render alone, and what it should look like, which is written once."""
 
 
-class Snapshots(Renders):
+class Snapshots(RenderingCallback):
     """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, and once more at the end.
 
-    Of views beyond `max_pixels`, and where there is not time for all (see `Renders`), every n-th row and column is rendered.
+    Of views beyond `max_pixels`, and where time is short (see `RenderingCallback`), every n-th row and column is rendered.
 
     Args:
         steps: after which steps; None means 10, 20, 50, 100, 200, 500, ...
@@ -39,9 +39,9 @@ class Snapshots(Renders):
         self.steps = steps
         self.view = view
         self.max_pixels = max_pixels
-        self._written: int | None = None  # the step of the latest
+        self._last_written_step: int | None = None  # the step of the latest
 
-    def steps_until(self, last: float) -> list[int]:
+    def list_snapshot_steps(self, last: float) -> list[int]:
         """The steps after which there is a snapshot, up to the `last`."""
         if self.steps is not None:
             return [step for step in self.steps if step <= last]
@@ -50,47 +50,53 @@ class Snapshots(Renders):
 
     def check(self, data: DataModule) -> None:
         """Called before a run writes anything."""
-        views = data.held_out_views
+        views = data.num_held_out_views
         if not 0 <= self.view < views:
             raise InputError("callbacks.snapshots.view", "", str(self.view), f"a held-out view from 0 to {views - 1}")
 
-    def pixels_left(self, trainer: L.Trainer) -> float:
-        step, progress = trainer.global_step, Budget.of(trainer).progress(trainer.global_step)
+    def count_remaining_pixels(self, trainer: L.Trainer) -> float:
+        step, progress = trainer.global_step, Budget.find(trainer).progress(trainer.global_step)
         last = step / progress if progress else step
-        left = {one for one in (*self.steps_until(last), round(last)) if one >= step and one != self._written}
-        return len(left) * self.pixels(trainer)
+        left = {
+            one
+            for one in (*self.list_snapshot_steps(last), round(last))
+            if one >= step and one != self._last_written_step
+        }
+        return len(left) * self.count_pixels(trainer)
 
-    def pixels(self, trainer: L.Trainer) -> int:
+    def count_pixels(self, trainer: L.Trainer) -> int:
         """Of a snapshot for which there is time."""
-        pixels = data_of(trainer).pixels_held_out(self.view)
+        pixels = get_datamodule(trainer).count_held_out_pixels(self.view)
         return min(pixels, self.max_pixels or pixels)
 
     def write(self, trainer: L.Trainer, pl_module: System) -> None:
         if not trainer.is_global_zero:
             return
-        budget, data, step = Budget.of(trainer), data_of(trainer), trainer.global_step
+        budget, data, step = Budget.find(trainer), get_datamodule(trainer), trainer.global_step
         folder, logger = Path(trainer.default_root_dir), trainer.logger
-        most = self.share(trainer, pl_module) * self.pixels(trainer)
-        with budget.rendering(trainer, "snapshot"):
-            subset = thin(data.pixels_held_out(self.view), most)
+        max_pixels = self.compute_affordable_fraction(trainer, pl_module) * self.count_pixels(trainer)
+        with budget.pause_to_render(trainer, "snapshot"):
+            subset = make_subset(data.count_held_out_pixels(self.view), max_pixels)
             (result,) = pl_module.evaluate_held_out(data, [self.view], subset)
-        budget.plan.note(result.pixels, result.seconds)
-        self._written = step
-        with budget.paused():  # not `rendering`: a signal may not break what others write on
+        budget.render_timer.add_timing(result.num_pixels, result.seconds)
+        self._last_written_step = step
+        with budget.pause():  # not `pause_to_render`: a signal may not break what others write on
             caption = f"{data.scene.name}, step {step}, {budget.seconds:.0f} s, {result.psnr:.2f} dB"
-            picture = result_panel(result, caption)
-            write_png(folder / FOLDER / f"step_{step:07d}.png", picture)
-            write_png(folder / FINAL, to_bytes(result.rgb))
-            if not (folder / TRUTH).exists():
-                write_png(folder / TRUTH, to_bytes(result.truth))
+            picture = make_result_panel(result, caption)
+            write_png(folder / SNAPSHOT_FOLDER / f"step_{step:07d}.png", picture)
+            write_png(folder / FINAL_FILE, to_uint8(result.rgb))
+            if not (folder / TRUTH_FILE).exists():
+                write_png(folder / TRUTH_FILE, to_uint8(result.truth))
             if isinstance(logger, L.pytorch.loggers.TensorBoardLogger):
-                logger.experiment.add_image("images/view", narrowed(picture, LOGGED_WIDTH), step, dataformats="HWC")
+                logger.experiment.add_image(
+                    "images/view", limit_width(picture, MAX_LOGGED_WIDTH), step, dataformats="HWC"
+                )
                 logger.experiment.flush()  # while paused: TensorBoard's thread would take time from training
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
-        if trainer.global_step in self.steps_until(trainer.global_step):
+        if trainer.global_step in self.list_snapshot_steps(trainer.global_step):
             self.write(trainer, pl_module)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        if trainer.global_step != self._written:
+        if trainer.global_step != self._last_written_step:
             self.write(trainer, pl_module)

@@ -6,9 +6,9 @@ import lightning as L
 
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.system import System, mse_to_psnr
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.option_checks import Count
 
-TRAIN_SECONDS = "speed/train_seconds"
+TRAIN_SECONDS_KEY = "speed/train_seconds"
 """The time that a step's figures belong to, logged with them."""
 
 
@@ -25,11 +25,11 @@ class Throughput(L.Callback):
         self.every = every
         self.rays = 0
         """Rays (or pixels) trained on since the run began, over all resumes."""
-        self._mark = (0.0, 0)  # seconds and rays at the last entry
+        self._last_entry = (0.0, 0)  # seconds and rays at the last entry
         self._samples = 0
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
-        self._mark = (Budget.of(trainer).seconds, self.rays)
+        self._last_entry = (Budget.find(trainer).seconds, self.rays)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:
         stats, step = pl_module.stats, trainer.global_step
@@ -37,18 +37,18 @@ class Throughput(L.Callback):
         self._samples += stats.samples * trainer.world_size
         if step % self.every:
             return
-        seconds, rays = Budget.of(trainer).seconds, self.rays - self._mark[1]
+        seconds, rays = Budget.find(trainer).seconds, self.rays - self._last_entry[1]
         if trainer.logger is not None:
             scalars = {
                 **{f"loss/{name}": float(term) for name, term in stats.losses.items()},
                 "train/psnr": mse_to_psnr(float(stats.mse)),
                 **{f"lr/{group['name']}": group["lr"] for group in trainer.optimizers[0].param_groups},
-                "speed/rays_per_second": rays / max(seconds - self._mark[0], 1e-9),
+                "speed/rays_per_second": rays / max(seconds - self._last_entry[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),
-                TRAIN_SECONDS: seconds,
+                TRAIN_SECONDS_KEY: seconds,
             }
             trainer.logger.log_metrics(scalars, step)
-        self._mark, self._samples = (seconds, self.rays), 0
+        self._last_entry, self._samples = (seconds, self.rays), 0
 
     def state_dict(self) -> dict[str, int]:
         return {"rays": self.rays}

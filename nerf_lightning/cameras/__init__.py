@@ -1,36 +1,43 @@
 """Stage 1, cameras: pixels -> Rays, and the Bounds of the content along them."""
 
-from nerf_lightning.cameras.bounds import Bounds, InBounds
+from nerf_lightning.cameras.bounds import BoundedModule, Bounds
+from nerf_lightning.cameras.camera_layout import CameraLayout, classify_layout
 from nerf_lightning.cameras.cameras import Cameras, Rays, has_panoramas
-from nerf_lightning.cameras.layout import Layout, classify_layout
 from nerf_lightning.cameras.lenses import Distortion, Lenses, Projection
-from nerf_lightning.cameras.paths import orbit_like, pivot_of, resample_path, spiral_like
-from nerf_lightning.cameras.poses import find_up, look_at, orbit_around, turn_upright, typical_view, upward
-from nerf_lightning.cameras.transforms import in_other_frame, pixel_to_camera, transform, transform_directions
+from nerf_lightning.cameras.paths import find_pivot, make_orbit_path, make_spiral_path, resample_path
+from nerf_lightning.cameras.poses import (
+    estimate_up,
+    find_typical_view,
+    look_at,
+    make_circle_poses,
+    mean_up,
+    rotation_to_z_up,
+)
+from nerf_lightning.cameras.transforms import pixel_to_camera, transform_directions, transform_points, transform_poses
 
 __all__ = [
     "Bounds",
     "Cameras",
     "Distortion",
-    "InBounds",
-    "Layout",
+    "BoundedModule",
+    "CameraLayout",
     "Lenses",
     "Projection",
     "Rays",
     "classify_layout",
-    "find_up",
+    "estimate_up",
     "has_panoramas",
-    "in_other_frame",
+    "transform_poses",
     "look_at",
-    "orbit_around",
-    "orbit_like",
+    "make_circle_poses",
+    "make_orbit_path",
     "pixel_to_camera",
-    "pivot_of",
+    "find_pivot",
     "resample_path",
-    "spiral_like",
-    "transform",
+    "make_spiral_path",
+    "transform_points",
     "transform_directions",
-    "turn_upright",
-    "typical_view",
-    "upward",
+    "rotation_to_z_up",
+    "find_typical_view",
+    "mean_up",
 ]

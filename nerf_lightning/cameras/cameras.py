@@ -9,13 +9,20 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from nerf_lightning.cameras.lenses import Lenses, Projection, distort, to_directions, to_flat, undistort
-from nerf_lightning.cameras.transforms import on_sensor
-from nerf_lightning.utils.tensors import TensorDataclass
+from nerf_lightning.cameras.lenses import (
+    Lenses,
+    Projection,
+    directions_to_normalized,
+    distort,
+    normalized_to_directions,
+    undistort,
+)
+from nerf_lightning.cameras.transforms import pixels_to_normalized
+from nerf_lightning.utils.tensor_dataclass import TensorDataclass
 
 PINHOLE_FOV_DEG, PINHOLE_ASPECT = 90.0, 4 / 3
 """Horizontal field of view, and width by height, of pinhole cameras that stand for equirectangular ones."""
-LATTICE = 33
+UNDISTORT_TABLE_SIZE = 33
 """Places along each side of a photo where its lens is undone beforehand: between them one step of Newton's method suffices."""
 
 
@@ -46,7 +53,7 @@ class Cameras(TensorDataclass):
     """None for pinhole cameras."""
 
     @classmethod
-    def of_size(cls, K: Float[Tensor, "V 3 3"], c2w: Float[Tensor, "V 4 4"], width: int, height: int) -> "Cameras":
+    def pinhole(cls, K: Float[Tensor, "V 3 3"], c2w: Float[Tensor, "V 4 4"], width: int, height: int) -> "Cameras":
         """Pinhole cameras of one size."""
         return cls(K, c2w, torch.tensor([[width, height]]).repeat(len(c2w), 1))
 
@@ -86,28 +93,28 @@ class Cameras(TensorDataclass):
         return height
 
     @property
-    def longest(self) -> int:
+    def max_side(self) -> int:
         """The longest side of any view in pixels."""
         return int(self.sizes.max())
 
-    def resized(self, sizes: Int[Tensor, "V 2"] | tuple[int, int]) -> "Cameras":
+    def resize(self, sizes: Int[Tensor, "V 2"] | tuple[int, int]) -> "Cameras":
         """The same views on other pixel grids; K scales with them (pixel edges, not centres, stay in place)."""
         if isinstance(sizes, tuple):
             sizes = torch.tensor([sizes]).repeat(len(self), 1)
         scale = torch.cat([sizes.double() / self.sizes, torch.ones(len(self), 1, dtype=torch.float64)], dim=1)
         return replace(self, K=self.K * scale[:, :, None].to(self.K), sizes=sizes)
 
-    def scaled(self, factor: float) -> "Cameras":
+    def rescale(self, factor: float) -> "Cameras":
         """The same views, that many times as large; never smaller than a pixel."""
-        return self.resized((self.sizes * factor).round().long().clamp_min(1))
+        return self.resize((self.sizes * factor).round().long().clamp_min(1))
 
-    def zoomed(self, factor: float) -> "Cameras":
+    def zoom(self, factor: float) -> "Cameras":
         """The same views with that many times the focal length, whose lenses bend the same places of a photo alike."""
         K = self.K.clone()
         K[:, :2, :2] *= factor
-        return replace(self, K=K, lenses=None if self.lenses is None else self.lenses.zoomed(factor))
+        return replace(self, K=K, lenses=None if self.lenses is None else self.lenses.zoom(factor))
 
-    def as_pinholes(self) -> "Cameras":
+    def to_pinhole(self) -> "Cameras":
         """Pinhole cameras in the same places, without distortion. Equirectangular views become `PINHOLE_FOV_DEG` wide, with the
         same pixels per angle at the centre."""
         if self.lenses is None:
@@ -121,11 +128,11 @@ class Cameras(TensorDataclass):
         sizes = torch.where(everywhere.cpu()[:, None], sizes, self.sizes)
         return Cameras(torch.where(everywhere[:, None, None], K.to(self.K), self.K), self.c2w, sizes)
 
-    def pixel_width(self, place: Float[Tensor, "3"]) -> float:
+    def pixel_footprint(self, point: Float[Tensor, "3"]) -> float:
         """Width of what one pixel shows at a place, world units: the median over the views."""
-        return float(((self.centres - place).norm(dim=1) / self.K[:, 0, 0]).median())
+        return float(((self.centres - point).norm(dim=1) / self.K[:, 0, 0]).median())
 
-    def rays(self, view: Int[Tensor, "R"], row: Int[Tensor, "R"], col: Int[Tensor, "R"]) -> Rays:
+    def generate_rays(self, view: Int[Tensor, "R"], row: Int[Tensor, "R"], col: Int[Tensor, "R"]) -> Rays:
         """Rays through the centres of the given pixels."""
         u, v = col.to(self.K.dtype) + 0.5, row.to(self.K.dtype) + 0.5
         if self.lenses is None:
@@ -133,9 +140,14 @@ class Cameras(TensorDataclass):
             directions = across * u[:, None] + down * v[:, None] + ahead
         else:
             coefficients = self.lenses.coefficients[view]
-            places = torch.stack([u, v], dim=1)
-            flat = undistort(on_sensor(self.K[view], places), coefficients, self._guess(view, places), steps=1)
-            local = to_directions(flat, self.lenses.projection[view])
+            points = torch.stack([u, v], dim=1)
+            normalized = undistort(
+                pixels_to_normalized(self.K[view], points),
+                coefficients,
+                self._interpolate_undistorted(view, points),
+                steps=1,
+            )
+            local = normalized_to_directions(normalized, self.lenses.projection[view])
             directions = (self.c2w[view, :3, :3] * local[:, None]).sum(2)
         return Rays(self.centres[view], torch.nn.functional.normalize(directions, dim=1))
 
@@ -147,36 +159,40 @@ class Cameras(TensorDataclass):
         inverse = torch.linalg.solve_triangular(K, identity, upper=True)
         return (rotation @ inverse).mT.to(self.K).contiguous()
 
-    def _guess(self, view: Int[Tensor, "R"], places: Float[Tensor, "R 2"]) -> Float[Tensor, "R 2"]:
+    def _interpolate_undistorted(self, view: Int[Tensor, "R"], points: Float[Tensor, "R 2"]) -> Float[Tensor, "R 2"]:
         """Undistorted flat coordinates of places in pixels, good enough for one step of Newton's method to end."""
-        which, tables, scale = self._lattices
+        which, tables, scale = self._undistort_tables
         lens = which[view]
-        at = places * scale[view]
-        low = at.long().clamp(max=LATTICE - 2)
+        at = points * scale[view]
+        low = at.long().clamp(max=UNDISTORT_TABLE_SIZE - 2)
         across, down = (at - low).unbind(1)
-        first = (lens * LATTICE + low[:, 1]) * LATTICE + low[:, 0]
-        corners = [tables[first + step] for step in (0, 1, LATTICE, LATTICE + 1)]
+        first = (lens * UNDISTORT_TABLE_SIZE + low[:, 1]) * UNDISTORT_TABLE_SIZE + low[:, 0]
+        corners = [tables[first + step] for step in (0, 1, UNDISTORT_TABLE_SIZE, UNDISTORT_TABLE_SIZE + 1)]
         above, below = (torch.lerp(a, b, across[:, None]) for a, b in (corners[:2], corners[2:]))
         return torch.lerp(above, below, down[:, None])
 
     @cached_property
-    def _lattices(self) -> tuple[Int[Tensor, "V"], Float[Tensor, "entries 2"], Float[Tensor, "V 2"]]:
+    def _undistort_tables(self) -> tuple[Int[Tensor, "V"], Float[Tensor, "entries 2"], Float[Tensor, "V 2"]]:
         """For each view the number of its lens; for all lenses, one after the other, undistorted flat coordinates on a lattice
         over the photo; and the factor from pixels to the lattice."""
         assert self.lenses is not None  # pinhole cameras need none
         sizes = self.sizes.to(self.K)
         every = torch.cat([self.K.flatten(1), sizes, self.lenses.coefficients], dim=1)
         lenses, which = torch.unique(every, dim=0, return_inverse=True)
-        K, size, coefficients = lenses.repeat_interleave(LATTICE**2, dim=0).tensor_split([9, 11], dim=1)
-        t = torch.linspace(0, 1, LATTICE, dtype=self.K.dtype, device=self.K.device)
+        K, size, coefficients = lenses.repeat_interleave(UNDISTORT_TABLE_SIZE**2, dim=0).tensor_split([9, 11], dim=1)
+        t = torch.linspace(0, 1, UNDISTORT_TABLE_SIZE, dtype=self.K.dtype, device=self.K.device)
         lattice = torch.stack(torch.meshgrid(t, t, indexing="xy"), dim=2).view(-1, 2).repeat(len(lenses), 1)
-        return which, undistort(on_sensor(K.view(-1, 3, 3), lattice * size), coefficients), (LATTICE - 1) / sizes
+        return (
+            which,
+            undistort(pixels_to_normalized(K.view(-1, 3, 3), lattice * size), coefficients),
+            (UNDISTORT_TABLE_SIZE - 1) / sizes,
+        )
 
-    def view_rays(self, view: int) -> Rays:
+    def generate_view_rays(self, view: int) -> Rays:
         """All H*W rays of one view, row by row."""
         width, height = self.size(view)
         pixel = torch.arange(height * width, device=self.K.device)
-        return self.rays(torch.full_like(pixel, view), pixel // width, pixel % width)
+        return self.generate_rays(torch.full_like(pixel, view), pixel // width, pixel % width)
 
     def project(
         self, points: Float[Tensor, "N 3"], view: int
@@ -191,15 +207,17 @@ class Cameras(TensorDataclass):
         local = (points - self.centres[view]).to(self.c2w) @ self.c2w[view, :3, :3]
         depth = local[:, 2]
         if self.lenses is None:
-            ahead, flat = depth > 0, local[:, :2] / torch.where(depth > 0, depth, 1.0)[:, None]
+            ahead, normalized = depth > 0, local[:, :2] / torch.where(depth > 0, depth, 1.0)[:, None]
         else:
             lens = self.lenses[view : view + 1]
-            flat = to_flat(local, lens.projection)
+            normalized = directions_to_normalized(local, lens.projection)
             # Beyond the rim a polynomial may lead back into the picture.
-            ahead = ((depth > 0) | (lens.projection != Projection.PERSPECTIVE)) & (flat.norm(dim=1) <= self.rims[view])
-            flat = distort(flat, lens.coefficients)[0]
+            ahead = ((depth > 0) | (lens.projection != Projection.PERSPECTIVE)) & (
+                normalized.norm(dim=1) <= self.max_visible_radius[view]
+            )
+            normalized = distort(normalized, lens.coefficients)[0]
         K, size = self.K[view], self.sizes[view].to(self.K)
-        pixels = flat @ K[:2, :2].T + K[:2, 2]
+        pixels = normalized @ K[:2, :2].T + K[:2, 2]
         if self.lenses is not None:
             everywhere = lens.projection == Projection.EQUIRECTANGULAR
             depth = torch.where(everywhere, local.norm(dim=1), depth)
@@ -210,11 +228,11 @@ class Cameras(TensorDataclass):
         return pixels, depth, inside
 
     @cached_property
-    def rims(self) -> Float[Tensor, "V"]:
+    def max_visible_radius(self) -> Float[Tensor, "V"]:
         """The largest flat radius (see `Lenses`) that each view shows."""
         assert self.lenses is not None  # pinhole cameras need none
-        which, tables, _ = self._lattices
-        return (tables.norm(dim=1).view(-1, LATTICE**2).amax(1) * 1.001)[which]
+        which, tables, _ = self._undistort_tables
+        return (tables.norm(dim=1).view(-1, UNDISTORT_TABLE_SIZE**2).amax(1) * 1.001)[which]
 
 
 def has_panoramas(cameras: Cameras) -> bool:

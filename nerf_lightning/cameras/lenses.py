@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.utils.tensors import TensorDataclass
+from nerf_lightning.utils.tensor_dataclass import TensorDataclass
 
-NEWTON = 8
+NEWTON_STEPS = 8
 """Steps of Newton's method that undo a distortion; real lenses need three or four for single precision."""
-NEVER = 1e-7
+EPS = 1e-7
 
 
 class Distortion(NamedTuple):
@@ -34,7 +34,7 @@ class Distortion(NamedTuple):
     """Thin prism: s1 r^2 to the right, s2 r^2 down."""
 
 
-POWERS = Distortion(k1=2, k2=4, k3=6, k4=8, d1=2, d2=4, d3=6, p1=1, p2=1, s1=1, s2=1)
+DISTORTION_POWERS = Distortion(k1=2, k2=4, k3=6, k4=8, d1=2, d2=4, d3=6, p1=1, p2=1, s1=1, s2=1)
 """Of the distance from the axis, by which each bends a place in proportion to that distance."""
 
 
@@ -61,14 +61,14 @@ class Lenses(TensorDataclass):
     projection: Int[Tensor, "V"]
     """See `Projection`."""
 
-    def zoomed(self, factor: float) -> "Lenses":
+    def zoom(self, factor: float) -> "Lenses":
         """Of cameras with that many times the focal length, which bend the same places of a photo alike: a place is bent by how
         far it lies from the axis in focal lengths."""
-        return Lenses(self.coefficients * factor ** self.coefficients.new_tensor(POWERS), self.projection)
+        return Lenses(self.coefficients * factor ** self.coefficients.new_tensor(DISTORTION_POWERS), self.projection)
 
 
 def distort(
-    flat: Float[Tensor, "N 2"], coefficients: Float[Tensor, "#N 11"]
+    normalized: Float[Tensor, "N 2"], coefficients: Float[Tensor, "#N 11"]
 ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, "N 2 2"]]:
     """Moves flat coordinates as a lens does.
 
@@ -79,7 +79,7 @@ def distort(
         Where they come to lie, and the Jacobian of that.
     """
     k1, k2, k3, k4, d1, d2, d3, p1, p2, s1, s2 = coefficients.unbind(1)
-    x, y = flat.unbind(1)
+    x, y = normalized.unbind(1)
     r2 = x * x + y * y
     above = 1 + r2 * (k1 + r2 * (k2 + r2 * (k3 + r2 * k4)))
     below = 1 + r2 * (d1 + r2 * (d2 + r2 * d3))
@@ -105,36 +105,36 @@ def distort(
 
 
 def undistort(
-    seen: Float[Tensor, "N 2"],
+    distorted: Float[Tensor, "N 2"],
     coefficients: Float[Tensor, "#N 11"],
     start: Float[Tensor, "N 2"] | None = None,
-    steps: int = NEWTON,
+    steps: int = NEWTON_STEPS,
 ) -> Float[Tensor, "N 2"]:
     """The inverse of `distort`, by Newton's method.
 
     Args:
-        seen: where the flat coordinates came to lie.
+        distorted: where the flat coordinates came to lie.
         coefficients: see `Lenses`.
-        start: guesses; None starts from `seen`.
+        start: guesses; None starts from `distorted`.
         steps: of Newton's method.
     """
-    flat = seen if start is None else start
+    normalized = distorted if start is None else start
     for _ in range(steps):
-        moved, jacobian = distort(flat, coefficients)
+        moved, jacobian = distort(normalized, coefficients)
         (a, b), (c, d) = (row.unbind(1) for row in jacobian.unbind(1))
         determinant = a * d - b * c
-        determinant = torch.where(determinant.abs() < NEVER, NEVER, determinant)
-        u, v = (seen - moved).unbind(1)
-        flat = flat + torch.stack([d * u - b * v, a * v - c * u], dim=1) / determinant[:, None]
-    return flat
+        determinant = torch.where(determinant.abs() < EPS, EPS, determinant)
+        u, v = (distorted - moved).unbind(1)
+        normalized = normalized + torch.stack([d * u - b * v, a * v - c * u], dim=1) / determinant[:, None]
+    return normalized
 
 
-def to_directions(flat: Float[Tensor, "N 2"], projection: Int[Tensor, "#N"]) -> Float[Tensor, "N 3"]:
+def normalized_to_directions(normalized: Float[Tensor, "N 2"], projection: Int[Tensor, "#N"]) -> Float[Tensor, "N 3"]:
     """Directions of any length, camera frame, with some flat coordinates."""
-    theta = flat.norm(dim=1, keepdim=True)
-    perspective = torch.cat([flat, torch.ones_like(theta)], dim=1)
-    fisheye = torch.cat([flat * torch.sinc(theta / torch.pi), theta.cos()], dim=1)  # sin(theta) / theta
-    longitude, latitude = flat.unbind(1)
+    theta = normalized.norm(dim=1, keepdim=True)
+    perspective = torch.cat([normalized, torch.ones_like(theta)], dim=1)
+    fisheye = torch.cat([normalized * torch.sinc(theta / torch.pi), theta.cos()], dim=1)  # sin(theta) / theta
+    longitude, latitude = normalized.unbind(1)
     level = latitude.cos()
     equirectangular = torch.stack([longitude.sin() * level, latitude.sin(), longitude.cos() * level], dim=1)
     kind = projection[:, None]
@@ -142,12 +142,12 @@ def to_directions(flat: Float[Tensor, "N 2"], projection: Int[Tensor, "#N"]) -> 
     return torch.where(kind == Projection.PERSPECTIVE, perspective, bent)
 
 
-def to_flat(directions: Float[Tensor, "N 3"], projection: Int[Tensor, "#N"]) -> Float[Tensor, "N 2"]:
-    """The inverse of `to_directions`; of no use for directions that a perspective lens does not see (z <= 0)."""
+def directions_to_normalized(directions: Float[Tensor, "N 3"], projection: Int[Tensor, "#N"]) -> Float[Tensor, "N 2"]:
+    """The inverse of `normalized_to_directions`; of no use for directions that a perspective lens does not see (z <= 0)."""
     across, ahead = directions[:, :2], directions[:, 2:]
-    beside = across.norm(dim=1, keepdim=True)
-    perspective = across / torch.where(ahead.abs() < NEVER, NEVER, ahead)
-    fisheye = across * torch.atan2(beside, ahead) / beside.clamp_min(NEVER)
+    radius = across.norm(dim=1, keepdim=True)
+    perspective = across / torch.where(ahead.abs() < EPS, EPS, ahead)
+    fisheye = across * torch.atan2(radius, ahead) / radius.clamp_min(EPS)
     x, y, z = directions.unbind(1)
     equirectangular = torch.stack([torch.atan2(x, z), torch.atan2(y, torch.hypot(x, z))], dim=1)
     kind = projection[:, None]

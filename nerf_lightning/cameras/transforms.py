@@ -5,7 +5,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def transform(c2w: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3"]:
+def transform_points(
+    c2w: Float[Tensor, "*#batch 4 4"], points: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3"]:
     """Maps points from camera to world: x_w = R x_c + t, with c2w = [R t; 0 1]. Batches broadcast."""
     return transform_directions(c2w, points) + c2w[..., :3, 3]
 
@@ -17,7 +19,7 @@ def transform_directions(
     return (c2w[..., :3, :3] * directions[..., None, :]).sum(-1)
 
 
-def in_other_frame(c2w: Float[Tensor, "V 4 4"], similarity: Float[Tensor, "4 4"]) -> Float[Tensor, "V 4 4"]:
+def transform_poses(c2w: Float[Tensor, "V 4 4"], similarity: Float[Tensor, "4 4"]) -> Float[Tensor, "V 4 4"]:
     """Poses in the frame that a similarity (a turn, a scale and a shift) leads to, in double precision; they stay rigid."""
     moved = similarity.double() @ c2w.double()
     moved[:, :3, :3] /= torch.linalg.det(similarity[:3, :3].double()) ** (1 / 3)
@@ -34,11 +36,11 @@ def pixel_to_camera(
         uv: continuous pixel coordinates (x right, y down); the centre of pixel (row, col) is (col + 0.5, row + 0.5).
         depth: distance along the camera's z axis, in the scene's unit.
     """
-    flat = on_sensor(K, uv)
-    return torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1) * depth[..., None]
+    normalized = pixels_to_normalized(K, uv)
+    return torch.cat([normalized, torch.ones_like(normalized[..., :1])], dim=-1) * depth[..., None]
 
 
-def on_sensor(K: Float[Tensor, "*#batch 3 3"], uv: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*batch 2"]:
+def pixels_to_normalized(K: Float[Tensor, "*#batch 3 3"], uv: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*batch 2"]:
     """Flat coordinates (x/z, y/z of a pinhole camera) of places in pixels: K^-1 [u, v, 1] by back-substitution."""
     y = (uv[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
     x = (uv[..., 0] - K[..., 0, 2] - K[..., 0, 1] * y) / K[..., 0, 0]

@@ -22,14 +22,14 @@ from nerf_lightning.cli.stability import stability
 from nerf_lightning.cli.train import describe_groups, is_override, train
 from nerf_lightning.cli.view import view
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import full_disk, no_room
-from nerf_lightning.utils.libraries import shorten_openmp_waits
+from nerf_lightning.utils.files import disk_full_error, is_disk_full
+from nerf_lightning.utils.libraries import limit_openmp_spinning
 from nerf_lightning.utils.signals import exit_on_signal
 
-TRACEBACK = "NERF_LIGHTNING_TRACEBACK"
+TRACEBACK_VARIABLE = "NERF_LIGHTNING_TRACEBACK"
 """Environment variable: set to 1, errors come with the full traceback."""
 
-FIRST_STEPS = """From a folder of photos to a page to send, and a mesh:
+QUICK_START = """From a folder of photos to a page to send, and a mesh:
 
     nerf_lightning train dataset=photos dataset.path=PHOTOS
     nerf_lightning export html -o page.html
@@ -40,7 +40,7 @@ nerf_lightning COMMAND --help says more of each."""
 app = App(
     name="nerf_lightning",
     help="Turn photos into a radiance field, on the machine you have.",
-    help_epilogue=FIRST_STEPS,
+    help_epilogue=QUICK_START,
     version=__version__,
     default_parameter=Parameter(negative=(), show_choices=False),
     print_error=False,
@@ -74,40 +74,42 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and is_override(words[0]):
         words.insert(0, "train")
-    shorten_openmp_waits()
+    limit_openmp_spinning()
     try:
         with exit_on_signal():
             app(words)
     except CycloptsError as error:
-        fail(error)
+        exit_with_error(error)
     except Exception as error:
-        if (known := find_cause(error)) is None:
+        if (known := find_input_error(error)) is None:
             raise
-        fail(known)
+        exit_with_error(known)
 
 
-def find_cause(error: Exception) -> InputError | None:
+def find_input_error(error: Exception) -> InputError | None:
     """What the user can mend about an error: bad input, a file that cannot be read or written, a torchvision built
     for another PyTorch, or memory that ran out; None for a defect."""
     if isinstance(error, InputError):
         return error
-    if full_disk(error):
-        return no_room(getattr(error, "filename", None) or os.getcwd())
+    if is_disk_full(error):
+        return disk_full_error(getattr(error, "filename", None) or os.getcwd())
     if isinstance(error, OSError) and error.filename:
         return InputError(error.filename, "", str(error.strerror), "a file or folder that can be read or written")
     if "torchvision::" in str(error):  # torchmetrics, which Lightning needs, imports an installed one
-        todo = "pip install --force-reinstall --no-deps torchvision, from the package index that PyTorch came from"
-        return InputError("torchvision", "", str(error), "one built for this PyTorch", todo)
+        hint = "pip install --force-reinstall --no-deps torchvision, from the package index that PyTorch came from"
+        return InputError("torchvision", "", str(error), "one built for this PyTorch", hint)
     if isinstance(error, MemoryError | RuntimeError):
-        from nerf_lightning.utils.memory import out_of_memory
+        from nerf_lightning.utils.memory import out_of_memory_error
 
-        return out_of_memory(error)
+        return out_of_memory_error(error)
     return None
 
 
-def fail(error: Exception) -> NoReturn:
+def exit_with_error(error: Exception) -> NoReturn:
     """Prints an error in one line, with its traceback if the environment asks for it, and exits with 2."""
-    if os.environ.get(TRACEBACK) == "1":
+    if os.environ.get(TRACEBACK_VARIABLE) == "1":
         traceback.print_exception(error)
-    print(f"nerf_lightning: {' '.join(str(error).split())} ({TRACEBACK}=1 shows the traceback)", file=sys.stderr)
+    print(
+        f"nerf_lightning: {' '.join(str(error).split())} ({TRACEBACK_VARIABLE}=1 shows the traceback)", file=sys.stderr
+    )
     sys.exit(2)

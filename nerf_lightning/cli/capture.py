@@ -7,12 +7,12 @@ from cyclopts import Parameter
 
 from nerf_lightning.cli.command import command
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import output_path, user_path
-from nerf_lightning.utils.options import AtLeast, AtMost
+from nerf_lightning.utils.files import check_output_path, expand_user_path
+from nerf_lightning.utils.option_checks import Ge, Le
 
-TagSize = Annotated[float, AtLeast(1e-4), AtMost(1)]
+TagSize = Annotated[float, Ge(1e-4), Le(1)]
 """Metres: printers make no smaller dots, and larger numbers are in another unit."""
-Squares = Annotated[int, AtLeast(3), AtMost(1000)]
+BoardSquares = Annotated[int, Ge(3), Le(1000)]
 """Along a side of a chessboard with inner corners."""
 
 
@@ -25,11 +25,11 @@ def capture(
     output: Annotated[Path, Parameter(alias="-o")] = Path("scene.npz"),
     dictionary: str = "auto",
     layout: Path | None = None,
-    board_columns: Squares | None = None,
-    board_rows: Squares | None = None,
+    board_columns: BoardSquares | None = None,
+    board_rows: BoardSquares | None = None,
     board_square: TagSize | None = None,
-    resize: Annotated[int, AtLeast(0)] = 300,
-    holdout: Annotated[int, AtLeast(2)] = 10,
+    resize: Annotated[int, Ge(0)] = 300,
+    holdout: Annotated[int, Ge(2)] = 10,
 ) -> Any:
     """Turn photos of a subject beside printed ArUco tags into a scene, with a report beside it.
 
@@ -51,25 +51,25 @@ def capture(
     Raises:
         InputError: an option or a photo is no good.
     """
-    target = output_path(output)
+    target = check_output_path(output)
     if target.suffix != ".npz":
         raise InputError("capture", "output", str(output), "a file name that ends in .npz")
     board = (board_columns, board_rows, board_square)
     if any(board) and not all(board):
         raise InputError("capture", "board_columns, board_rows, board_square", str(board), "all three, or none")
-    from nerf_lightning.capture.report.write import write_report
-    from nerf_lightning.capture.run import capture_scene
+    from nerf_lightning.capture.pipeline import capture_scene
+    from nerf_lightning.capture.report.report import write_report
     from nerf_lightning.capture.tags.board import Board
 
     found = capture_scene(
-        user_path(calibration),
-        user_path(photos),
+        expand_user_path(calibration),
+        expand_user_path(photos),
         tag_size,
         target,
         dictionary=dictionary,
         layout=layout,
         board=Board(board_columns, board_rows, board_square) if board_columns and board_rows and board_square else None,
-        longest=resize or None,
+        max_side=resize or None,
         holdout=holdout,
     )
     write_report(found, report := target.with_name(f"{target.stem}_report"))
@@ -94,7 +94,7 @@ def print_tags(
     Raises:
         InputError: no PDF, an unknown family or layout, or tags that do not fit on the page.
     """
-    from nerf_lightning.capture.tags.layout import read_layout
-    from nerf_lightning.capture.tags.printout import write_page
+    from nerf_lightning.capture.tags.printout import write_sheet_pdf
+    from nerf_lightning.capture.tags.tag_layout import read_layout
 
-    write_page(read_layout(layout, dictionary, tag_size), output_path(sheet))
+    write_sheet_pdf(read_layout(layout, dictionary, tag_size), check_output_path(sheet))

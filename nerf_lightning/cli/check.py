@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 from nerf_lightning.cli.command import Output, command
-from nerf_lightning.utils.options import AtLeast, Count
+from nerf_lightning.utils.option_checks import Count, Ge
 
 
 @command
@@ -14,8 +14,8 @@ def check(
     *,
     output: Output = None,
     resize: Count | None = 800,
-    holdout: Annotated[int, AtLeast(2)] = 8,
-    masked: Literal["auto", "unknown", "empty"] = "auto",
+    holdout: Annotated[int, Ge(2)] = 8,
+    masked: Literal["auto", "ignore", "background"] = "auto",
     invert_masks: bool = False,
     bounded: Literal["auto", "true", "false"] = "auto",
     orientation: Literal["auto", "stored", "exif"] = "auto",
@@ -27,7 +27,7 @@ def check(
         output: The page; default: check.html where the command runs.
         resize: Longest side of the photos in pixels, as in training; null for their size.
         holdout: Every N-th photo is held out, unless the files say which.
-        masked: What masks leave out: unknown, empty or auto.
+        masked: What masks leave out: ignore, background or auto.
         invert_masks: Masks are black where the photo is kept.
         bounded: Whether nothing is outside the box: true, false, or auto by the photos.
         orientation: How photos are turned: stored, exif, or auto as their cameras say.
@@ -38,20 +38,20 @@ def check(
     Raises:
         InputError: where there is no scene, or a damaged one.
     """
-    from nerf_lightning.check.findings import check_page, find_doubts, judge_photos, record_warnings
+    from nerf_lightning.check.report import assess_photos, check_before_training, record_warnings, render_check_page
     from nerf_lightning.dataset import PhotoLoadOptions, open_scene
-    from nerf_lightning.utils.files import output_path, write_text
+    from nerf_lightning.utils.files import check_output_path, write_text
 
-    path = output_path(output or "check.html")
+    path = check_output_path(output or "check.html")
     with record_warnings() as records:
         options = PhotoLoadOptions(resize, holdout, masked, invert_masks, bounded, orientation)
         found = open_scene(str(scene), options=options)
-        doubts = find_doubts(found)
+        remarks = check_before_training(found)
     warnings = [record.getMessage() for record in records]
-    photos, poses = judge_photos(found)
-    write_text(path, check_page(found, warnings + doubts, photos, poses))
-    bad = [f"{photo.name}: {trouble}" for photo in photos for trouble in photo.troubles]
-    for line in doubts + bad:
+    photos, poses = assess_photos(found)
+    write_text(path, render_check_page(found, warnings + remarks, photos, poses))
+    bad = [f"{photo.name}: {issue}" for photo in photos for issue in photo.issues]
+    for line in remarks + bad:
         print(line)
     print(f"{found.name}: {len(photos)} photos, {len(bad)} remarks on them; {path}")
-    return warnings + doubts + bad
+    return warnings + remarks + bad

@@ -8,7 +8,7 @@ from typing import Annotated, ParamSpec, TypeVar, get_args, get_type_hints
 
 from cyclopts import Parameter
 
-from nerf_lightning.utils.options import check_options
+from nerf_lightning.utils.option_checks import check_options
 
 P = ParamSpec("P")
 VAR_POSITIONAL = inspect.Parameter.VAR_POSITIONAL

@@ -4,14 +4,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from nerf_lightning.cli.command import Output, command
-from nerf_lightning.utils.options import AtLeast
+from nerf_lightning.utils.option_checks import Ge
 
 
 @command
 def compare(
     *runs: Path,
-    seconds: Annotated[float, AtLeast(0)] = 15.0,
-    within_db: Annotated[float, AtLeast(0)] = 0.5,
+    seconds: Annotated[float, Ge(0)] = 15.0,
+    within_db: Annotated[float, Ge(0)] = 0.5,
     references: str = "published",
     output: Output = None,
 ) -> Any:
@@ -32,15 +32,15 @@ def compare(
     Raises:
         InputError: for a folder that is not there or holds no run, and for references that cannot be read.
     """
-    from nerf_lightning.comparison.points import PUBLISHED, read_references
+    from nerf_lightning.comparison.points import PUBLISHED_FILE, read_references
     from nerf_lightning.comparison.report import write_comparison
-    from nerf_lightning.runs.find import OUTPUTS
-    from nerf_lightning.runs.index import find_runs
-    from nerf_lightning.utils.files import output_path, user_path
+    from nerf_lightning.runs.find import OUTPUT_ROOT
+    from nerf_lightning.runs.summaries import find_runs
+    from nerf_lightning.utils.files import check_output_path, expand_user_path
 
-    folders = [user_path(folder) for folder in runs] or [OUTPUTS]
-    folder = folders[0] / "compare" if output is None else output_path(output)
-    file = PUBLISHED if references in ("published", "none") else user_path(references)
+    folders = [expand_user_path(folder) for folder in runs] or [OUTPUT_ROOT]
+    folder = folders[0] / "compare" if output is None else check_output_path(output)
+    file = PUBLISHED_FILE if references in ("published", "none") else expand_user_path(references)
     published = read_references(file)
     published = published.head(0) if references == "none" else published
     found = {run.folder.resolve(): run for folder in folders for run in find_runs(folder)}

@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from nerf_lightning.cli.command import Device, Output, Photos, RunPath, command
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.find import find_run
-from nerf_lightning.utils.options import AtLeast
+from nerf_lightning.utils.option_checks import Ge
 
 
 @command
@@ -15,7 +15,7 @@ def evaluate(
     *,
     photos: Photos = None,
     split: Literal["val", "test"] = "val",
-    worst: Annotated[int, AtLeast(1)] = 3,
+    worst: Annotated[int, Ge(1)] = 3,
     output: Output = None,
     device: Device = "auto",
 ) -> dict[str, Any]:
@@ -36,31 +36,31 @@ def evaluate(
     """
     from dataclasses import replace
 
-    from nerf_lightning.drawing.contact_sheet import contact_sheet
-    from nerf_lightning.drawing.panels import result_panel, write_png
+    from nerf_lightning.drawing.contact_sheet import make_contact_sheet
+    from nerf_lightning.drawing.panels import make_result_panel, write_png
     from nerf_lightning.evaluate.metrics import format_table, measure_views, to_json
-    from nerf_lightning.runs.data import data_again
-    from nerf_lightning.runs.open import beside, open_run
-    from nerf_lightning.utils.device import the_device
-    from nerf_lightning.utils.files import output_path, write_json
-    from nerf_lightning.utils.machine import device_in_words
+    from nerf_lightning.runs.open import get_output_folder, open_run
+    from nerf_lightning.runs.reload import reload_data
+    from nerf_lightning.utils.device import resolve_device
+    from nerf_lightning.utils.files import check_output_path, write_json
+    from nerf_lightning.utils.machine import describe_device
 
-    where, source = the_device(device), find_run(run)
+    where, source = resolve_device(device), find_run(run)
     found = open_run(source, where)
-    data = data_again(found.cfg, found.scene, photos)
+    data = reload_data(found.cfg, found.scene, photos)
     if split == "test":
         if data.scene.test is None:
             raise InputError("evaluate", "split", "test", "val: these photos have no test split")
         data.scene = replace(data.scene, val=data.scene.test)
-    folder = beside(source) / "evaluation" if output is None else output_path(output)
+    folder = get_output_folder(source) / "evaluation" if output is None else check_output_path(output)
     metrics, results = measure_views(found.system, data, worst)
     evaluation = to_json(metrics, source, data.scene.describe(), where)
     write_json(folder / "views.json", evaluation)
     order = sorted(results, key=lambda view: results[view].psnr)
     captions = [f"view {view}, {metrics.psnr[view]:.2f} dB, SSIM {metrics.ssim[view]:.3f}" for view in order]
-    panels = [result_panel(results[view], "") for view in order]
-    write_png(folder / "worst.png", contact_sheet(panels, captions, columns=1))
+    panels = [make_result_panel(results[view], "") for view in order]
+    write_png(folder / "worst.png", make_contact_sheet(panels, captions, columns=1))
     print(format_table(metrics))
-    views = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views on {device_in_words(where)}"
+    views = f"{len(metrics)} {'test' if split == 'test' else 'held-out'} views on {describe_device(where)}"
     print(f"{data.scene.name}: {metrics.psnr.mean():.2f} dB over {views}; {folder}/worst.png, views.json")
     return evaluation

@@ -8,18 +8,18 @@ from cyclopts import App, Parameter
 from nerf_lightning.cli.command import Device, Output, Photos, RunPath, command
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.find import find_run
-from nerf_lightning.utils.options import AtLeast, AtMost, Side
+from nerf_lightning.utils.option_checks import Ge, GridSize, Le
 
 Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     Parameter(help="Keep only this part: X Y Z X Y Z of its lower, then upper corner, in the photos' unit."),
 ]
-Resolution = Annotated[Side | None, Parameter(help="Cells along the longest side; default: as fine as the photos.")]
+Resolution = Annotated[GridSize | None, Parameter(help="Cells along the longest side; default: as fine as the photos.")]
 Threshold = Annotated[
-    Annotated[float, AtLeast(0.001), AtMost(0.999)] | None,
+    Annotated[float, Ge(0.001), Le(0.999)] | None,
     Parameter(help="Opacity of a cell at the surface; default: found from the histogram of opacities."),
 ]
-LossDb = Annotated[float, AtLeast(0), Parameter(help="dB of held-out PSNR that may be lost.")]
+MaxPsnrDrop = Annotated[float, Ge(0), Parameter(help="dB of held-out PSNR that may be lost.")]
 
 export = App(name="export", help="Write a run as a file for other uses.")
 
@@ -42,7 +42,7 @@ def export_mesh(
     Args:
         output: FILE.ply, .glb (3D viewers), .obj (modellers) or .stl (printers; no colours); default: mesh.ply in the run.
     """
-    return _write_shape("mesh", run, output, device, resolution, box, threshold, photos)
+    return _write_geometry("mesh", run, output, device, resolution, box, threshold, photos)
 
 
 @export.command(name="points")
@@ -63,7 +63,7 @@ def export_points(
     Args:
         output: FILE.ply; default: points.ply in the run.
     """
-    return _write_shape("points", run, output, device, resolution, box, threshold, photos)
+    return _write_geometry("points", run, output, device, resolution, box, threshold, photos)
 
 
 @export.command(name="voxels")
@@ -82,7 +82,7 @@ def export_voxels(
     Args:
         output: FILE.npz; default: voxels.npz in the run.
     """
-    return _write_shape("voxels", run, output, device, resolution, box)
+    return _write_geometry("voxels", run, output, device, resolution, box)
 
 
 @export.command(name="compact")
@@ -91,7 +91,7 @@ def export_compact(
     run: RunPath = None,
     /,
     *,
-    loss_db: LossDb = 0.1,
+    max_psnr_drop: MaxPsnrDrop = 0.1,
     output: Output = None,
     photos: Photos = None,
     device: Device = "auto",
@@ -101,19 +101,19 @@ def export_compact(
     Args:
         output: FILE.npz; default: compact.npz in the run.
     """
-    from nerf_lightning.export.smallest import smallest
-    from nerf_lightning.runs.data import data_again
-    from nerf_lightning.runs.folder import plain_config
+    from nerf_lightning.export.compress import compress_system
+    from nerf_lightning.runs.folder import config_to_dict
     from nerf_lightning.runs.open import open_run
-    from nerf_lightning.utils.device import the_device
+    from nerf_lightning.runs.reload import reload_data
+    from nerf_lightning.utils.device import resolve_device
 
-    where, source = the_device(device), find_run(run)
-    target = _target(source, output, "compact.npz", (".npz",))
+    where, source = resolve_device(device), find_run(run)
+    target = _resolve_output(source, output, "compact.npz", (".npz",))
     found = open_run(source, where)
-    data = data_again(found.cfg, found.scene, photos)
-    compact = smallest(found.system, data, plain_config(found.cfg), loss_db)
+    data = reload_data(found.cfg, found.scene, photos)
+    compact = compress_system(found.system, data, config_to_dict(found.cfg), max_psnr_drop)
     size = f"{len(compact.content) / 1000:,.1f} kB, {compact.precision} precision"
-    return _write(target, compact.content, f"{size}, held-out PSNR {compact.before:.2f} -> {compact.psnr:.2f} dB")
+    return _write(target, compact.content, f"{size}, held-out PSNR {compact.psnr_before:.2f} -> {compact.psnr:.2f} dB")
 
 
 @export.command(name="html")
@@ -123,8 +123,8 @@ def export_html(
     /,
     *,
     all: bool = False,
-    cells: Side | None = None,
-    loss_db: LossDb = 0.1,
+    cells: GridSize | None = None,
+    max_psnr_drop: MaxPsnrDrop = 0.1,
     output: Output = None,
     photos: Photos = None,
     device: Device = "auto",
@@ -140,19 +140,19 @@ def export_html(
     """
     from functools import partial
 
-    from nerf_lightning.export.pages import build_page, write_gallery
-    from nerf_lightning.runs.find import OUTPUTS
-    from nerf_lightning.utils.device import the_device
+    from nerf_lightning.export.html import build_page, write_gallery
+    from nerf_lightning.runs.find import OUTPUT_ROOT
+    from nerf_lightning.utils.device import resolve_device
 
-    where = the_device(device)
-    build = partial(build_page, device=where, cells=cells, loss_db=loss_db, photos=photos)
+    where = resolve_device(device)
+    build = partial(build_page, device=where, cells=cells, max_psnr_drop=max_psnr_drop, photos=photos)
     if all:
-        folder = run or OUTPUTS
-        target = _target(folder, output, "gallery.html", (".html",))
+        folder = run or OUTPUT_ROOT
+        target = _resolve_output(folder, output, "gallery.html", (".html",))
         print(f"{target}: {write_gallery(folder, target, build)} fields side by side: open it in a browser")
         return target
     source = find_run(run)
-    target = _target(source, output, "field.html", (".html",))
+    target = _resolve_output(source, output, "field.html", (".html",))
     page, words = build(source)
     return _write(target, page.encode(), f"{len(page) / 1000:,.1f} kB, {words}: open it in a browser")
 
@@ -165,54 +165,54 @@ def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: 
     Args:
         output: A new folder; default: posed/ in the run.
     """
-    from nerf_lightning.export.photos import write_photos
-    from nerf_lightning.runs.data import data_again
+    from nerf_lightning.export.transforms import write_photos
     from nerf_lightning.runs.folder import load_config
-    from nerf_lightning.runs.scene_file import load_scene
-    from nerf_lightning.utils.files import atomic_folder, output_path
+    from nerf_lightning.runs.reload import reload_data
+    from nerf_lightning.runs.scene_file import read_scene_file
+    from nerf_lightning.utils.files import atomic_write_folder, check_output_path
 
     source = find_run(run)
-    target = source / "posed" if output is None else output_path(output)
+    target = source / "posed" if output is None else check_output_path(output)
     if target.exists():
         raise InputError(target, "", "something", "a folder that is not there yet", "give another -o, or remove it")
-    content = load_scene(source)  # a compact file does not know corrected cameras
-    data = data_again(load_config(source), content, photos)
-    if not data.has_cameras:
+    content = read_scene_file(source)  # a compact file does not know corrected cameras
+    data = reload_data(load_config(source), content, photos)
+    if not data.is_posed:
         raise InputError(source, "", "a picture's run", "a scene's run")
-    with atomic_folder(target) as temporary:
+    with atomic_write_folder(target) as temporary:
         write_photos(data.scene, temporary)
     cameras = "corrected" if "corrected" in content else "given"
     print(f"{target}: {len(data.scene.train) + len(data.scene.val)} photos and transforms.json, cameras as {cameras}")
     return target
 
 
-def _target(source: Path, output: Path | None, name: str, suffixes: tuple[str, ...]) -> Path:
+def _resolve_output(source: Path, output: Path | None, name: str, suffixes: tuple[str, ...]) -> Path:
     """The file to write: `output`, or one of a name in the run.
 
     Raises:
         InputError: for another suffix.
     """
-    from nerf_lightning.runs.open import beside
-    from nerf_lightning.utils.files import output_path
+    from nerf_lightning.runs.open import get_output_folder
+    from nerf_lightning.utils.files import check_output_path
 
     if output is None:
-        return beside(source) / name
+        return get_output_folder(source) / name
     if output.suffix.lower() not in suffixes:
         raise InputError("export", "output", output.name, f"a name ending in {', '.join(suffixes)}")
-    return output_path(output)
+    return check_output_path(output)
 
 
 def _write(target: Path, content: bytes, words: str) -> Path:
     """Writes a file and prints what it holds."""
-    from nerf_lightning.utils.files import atomic
+    from nerf_lightning.utils.files import atomic_write
 
-    with atomic(target) as temporary:
+    with atomic_write(target) as temporary:
         temporary.write_bytes(content)
     print(f"{target}: {words}")
     return target
 
 
-def _write_shape(
+def _write_geometry(
     kind: str,
     run: Path | None,
     output: Path | None,
@@ -227,26 +227,32 @@ def _write_shape(
         raise InputError("export", "box", " ".join(map(str, box)), "the lower, then the upper corner: X Y Z X Y Z")
     import torch
 
-    from nerf_lightning.export.mesh import SUFFIXES, mesh_file, points_file, training_views, voxels_file
+    from nerf_lightning.export.mesh import (
+        SUFFIXES,
+        build_mesh_file,
+        build_points_file,
+        build_voxels_file,
+        select_training_views,
+    )
     from nerf_lightning.export.volume import sample_volume
     from nerf_lightning.runs.open import open_scene_run
-    from nerf_lightning.utils.device import the_device
-    from nerf_lightning.utils.libraries import require
+    from nerf_lightning.utils.device import resolve_device
+    from nerf_lightning.utils.libraries import require_extra
 
-    where, source = the_device(device), find_run(run)
-    target = _target(source, output, kind + SUFFIXES[kind][0], SUFFIXES[kind])
+    where, source = resolve_device(device), find_run(run)
+    target = _resolve_output(source, output, kind + SUFFIXES[kind][0], SUFFIXES[kind])
     if kind != "voxels":
-        require("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
+        require_extra("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
     found = open_scene_run(source, where)
     volume = sample_volume(
         found, resolution, None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
     )
     if kind == "voxels":
-        content, words = voxels_file(found, volume)
+        content, words = build_voxels_file(found, volume)
     elif kind == "points":
-        content, words = points_file(found, training_views(found, photos), volume, threshold)
+        content, words = build_points_file(found, select_training_views(found, photos), volume, threshold)
     else:
         suffix = target.suffix.lower()
-        content, words = mesh_file(found, training_views(found, photos), volume, threshold, suffix)
+        content, words = build_mesh_file(found, select_training_views(found, photos), volume, threshold, suffix)
     size = f"{len(content) / 1e6:,.2f} MB"
     return _write(target, content, f"{size}, {words}, cells of {volume.cell * found.scale:.4g}")

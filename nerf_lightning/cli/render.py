@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from nerf_lightning.cli.command import Device, Output, Photos, RunPath, command
 from nerf_lightning.runs.find import find_run
-from nerf_lightning.utils.options import AtLeast, AtMost, FramesPerSecond
+from nerf_lightning.utils.option_checks import FramesPerSecond, Ge, Le
 
 
 @command
@@ -17,10 +17,10 @@ def render(
     *,
     path: str = "orbit",
     path_frame: Literal["auto", "run", "file"] = "auto",
-    frames: Annotated[int, AtLeast(1), AtMost(99_999)] | None = None,
+    frames: Annotated[int, Ge(1), Le(99_999)] | None = None,
     fps: FramesPerSecond = 30.0,
     background: str = "scene",
-    scale: Annotated[float, AtLeast(0.001), AtMost(1000)] = 1.0,
+    scale: Annotated[float, Ge(0.001), Le(1000)] = 1.0,
     channels: str = "rgb",
     output: Output = None,
     photos: Photos = None,
@@ -42,28 +42,30 @@ def render(
     Returns:
         The video, or the folder.
     """
-    from nerf_lightning.render.camera_path import SPLITS, build_path
-    from nerf_lightning.render.frames import choose_style, describe_frames, draw_frame
+    from nerf_lightning.render.camera_path import PHOTO_PATHS, build_path
+    from nerf_lightning.render.frames import build_manifest, draw_frame, parse_style
     from nerf_lightning.render.video import check_output, write_video
-    from nerf_lightning.runs.data import data_again
-    from nerf_lightning.runs.open import beside, open_scene_run
-    from nerf_lightning.utils.device import the_device
-    from nerf_lightning.utils.files import output_path
-    from nerf_lightning.utils.machine import device_in_words
+    from nerf_lightning.runs.open import get_output_folder, open_scene_run
+    from nerf_lightning.runs.reload import reload_data
+    from nerf_lightning.utils.device import resolve_device
+    from nerf_lightning.utils.files import check_output_path
+    from nerf_lightning.utils.machine import describe_device
 
     began = time.perf_counter()
     if output is not None:
-        check_output(output_path(output), background == "transparent")
-    where, source = the_device(device), find_run(run)
-    target = beside(source) / f"render_{Path(path).stem}.webp" if output is None else output_path(output)
+        check_output(check_output_path(output), background == "transparent")
+    where, source = resolve_device(device), find_run(run)
+    target = (
+        get_output_folder(source) / f"render_{Path(path).stem}.webp" if output is None else check_output_path(output)
+    )
     found = open_scene_run(source, where)
-    scene: Any = data_again(found.cfg, found.scene, photos).scene if path in SPLITS else None
+    scene: Any = reload_data(found.cfg, found.scene, photos).scene if path in PHOTO_PATHS else None
     route = build_path(path, frames, found.orbit, scene, found.to_source, path_frame, scale)
-    style = choose_style(found.system, route, channels, background)
-    plan, count = describe_frames(path, found.system, route, style), len(route.cameras)
-    there = write_video(plan, partial(draw_frame, found.system, route, style), count, target, fps)
+    style = parse_style(found.system, route, channels, background)
+    manifest, count = build_manifest(path, found.system, route, style), len(route.cameras)
+    there = write_video(manifest, partial(draw_frame, found.system, route, style), count, target, fps)
     width, height = route.cameras.sizes.amax(0).tolist()
-    seconds = f"{time.perf_counter() - began:.1f} s on {device_in_words(where)}"
+    seconds = f"{time.perf_counter() - began:.1f} s on {describe_device(where)}"
     seconds += f", {there} of them there already" if there else ""
     print(f"{target}: {count} frames of {width} x {height} pixels in {seconds}")
     return target

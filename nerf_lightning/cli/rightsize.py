@@ -7,9 +7,9 @@ from cyclopts import Parameter
 
 from nerf_lightning.cli.command import command
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.options import AtLeast
+from nerf_lightning.utils.option_checks import Ge
 
-IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic")
 """Suffixes of a 2D image."""
 
 
@@ -18,7 +18,7 @@ def rightsize(
     scene: str,
     /,
     *overrides: str,
-    within_db: Annotated[float, AtLeast(0)] | None = None,
+    within_db: Annotated[float, Ge(0)] | None = None,
     psnr: float | None = None,
     ladder: str | None = None,
     output: Annotated[Path, Parameter(alias="-o")] = Path("outputs/rightsize"),
@@ -49,43 +49,43 @@ def rightsize(
     from omegaconf.errors import OmegaConfBaseException
 
     from nerf_lightning.cli.train import translate_error
-    from nerf_lightning.config.compose import composed
-    from nerf_lightning.runs.owner import owned
+    from nerf_lightning.config.compose import compose_config
+    from nerf_lightning.runs.run_lock import lock_folder
     from nerf_lightning.sizing.choose import Target, read_ladder
-    from nerf_lightning.sizing.report import REPORT, explain, write_report
-    from nerf_lightning.sizing.search import begin, search
-    from nerf_lightning.utils.files import output_path
+    from nerf_lightning.sizing.report import REPORT_FILE, explain_choice, write_report
+    from nerf_lightning.sizing.search import search_sizes, start_or_resume
+    from nerf_lightning.utils.files import check_output_path
     from nerf_lightning.utils.parsing import read_json
 
-    folder = output_path(output)
+    folder = check_output_path(output)
     try:
-        cfg = composed([*describe_scene(scene), *overrides], folder)
+        cfg = compose_config([*describe_scene(scene), *overrides], folder)
     except (HydraException, OmegaConfBaseException) as error:
         raise translate_error(error) from error
     sizes = read_ladder(ladder or str(cfg.method))
     target = Target(psnr, 0.3 if within_db is None else within_db)
-    with owned(folder):
-        if (folder / REPORT).is_file():
-            begin(folder, cfg, target, sizes)
-            found = read_json(folder / REPORT, "a finished search")
+    with lock_folder(folder):
+        if (folder / REPORT_FILE).is_file():
+            start_or_resume(folder, cfg, target, sizes)
+            found = read_json(folder / REPORT_FILE, "a finished search")
         else:
-            found = search(cfg, target, sizes, folder)
+            found = search_sizes(cfg, target, sizes, folder)
             write_report(found, cfg, folder)
-    print(explain(found, folder))
+    print(explain_choice(found, folder))
     return found
 
 
 def describe_scene(scene: str) -> list[str]:
     """The overrides that a scene's path or an experiment's name stands for."""
     from nerf_lightning.config import conf_dir
-    from nerf_lightning.config.literal import override_of
-    from nerf_lightning.utils.files import user_path
+    from nerf_lightning.config.quoting import make_override
+    from nerf_lightning.utils.files import expand_user_path
 
     for key in ("+experiment", "dataset"):
         if scene.isidentifier() and (conf_dir() / key.lstrip("+") / f"{scene}.yaml").is_file():
             return [f"{key}={scene}"]
-    path = user_path(scene)
+    path = expand_user_path(scene)
     if not path.exists():
         raise InputError("rightsize", "scene", scene, "a path, or a name in conf/experiment or conf/dataset")
-    kind = "+experiment=picture" if path.suffix.lower() in IMAGES else "dataset=photos"
-    return [kind, override_of("dataset.path", path)]
+    kind = "+experiment=picture" if path.suffix.lower() in IMAGE_SUFFIXES else "dataset=photos"
+    return [kind, make_override("dataset.path", path)]

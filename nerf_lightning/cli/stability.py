@@ -7,7 +7,7 @@ from cyclopts import Parameter
 
 from nerf_lightning.cli.command import command
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.options import AtLeast, AtMost
+from nerf_lightning.utils.option_checks import Ge, Le
 
 
 @command
@@ -15,9 +15,9 @@ def stability(
     *,
     suite: Literal["quick", "full"] = "quick",
     methods: Annotated[list[str] | None, Parameter(consume_multiple=True)] = None,
-    seeds: Annotated[int, AtLeast(1), AtMost(1000)] = 8,
-    steps: Annotated[int, AtLeast(1)] = 300,
-    workers: Annotated[int, AtLeast(1)] | None = None,
+    seeds: Annotated[int, Ge(1), Le(1000)] = 8,
+    steps: Annotated[int, Ge(1)] = 300,
+    workers: Annotated[int, Ge(1)] | None = None,
     output: Annotated[Path, Parameter(alias="-o")] = Path("outputs/stability"),
 ) -> dict[str, Any]:
     """Train methods on small scenes made to be hard, and say which broke down.
@@ -38,20 +38,20 @@ def stability(
     Raises:
         InputError: where a method is not known, or another process writes into the folder.
     """
-    from nerf_lightning.runs.owner import owned
+    from nerf_lightning.runs.run_lock import lock_folder
     from nerf_lightning.stability.conditions import CONDITIONS, METHODS
     from nerf_lightning.stability.report import write_report
     from nerf_lightning.stability.trial import list_trials, run_trials
-    from nerf_lightning.utils.files import output_path
-    from nerf_lightning.utils.machine import cores
-    from nerf_lightning.utils.progress import tracked
+    from nerf_lightning.utils.files import check_output_path
+    from nerf_lightning.utils.machine import available_cores
+    from nerf_lightning.utils.progress import track_progress
 
     chosen = list(METHODS) if methods is None else methods
     unknown = [name for name in chosen if name not in METHODS]
     if unknown or not chosen:
         raise InputError("stability", "methods", ", ".join(unknown) or "none", f"some of {', '.join(METHODS)}")
     conditions = [one.name for one in CONDITIONS.values() if suite == "full" or one.quick]
-    trials, root = list_trials(conditions, chosen, seeds, steps), output_path(output)
-    with owned(root):
-        done = run_trials(trials, root, min(workers or cores(), len(trials)))
-        return write_report(list(tracked(done, len(trials), "trainings")), suite, root)
+    trials, root = list_trials(conditions, chosen, seeds, steps), check_output_path(output)
+    with lock_folder(root):
+        done = run_trials(trials, root, min(workers or available_cores(), len(trials)))
+        return write_report(list(track_progress(done, len(trials), "trainings")), suite, root)

@@ -12,7 +12,7 @@ from cyclopts import Parameter
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import remove_empty, user_path
+from nerf_lightning.utils.files import expand_user_path, remove_empty_folders
 from nerf_lightning.utils.text import suggest
 
 if TYPE_CHECKING:
@@ -73,23 +73,23 @@ def run_hydra(overrides: Sequence[str]) -> None:
     from omegaconf import OmegaConf, read_write
     from omegaconf.errors import OmegaConfBaseException
 
-    from nerf_lightning.cli.app import fail, find_cause
+    from nerf_lightning.cli.app import exit_with_error, find_input_error
     from nerf_lightning.config import resolvers  # noqa: F401  (conf/ uses the resolvers)
-    from nerf_lightning.config.literal import escape
+    from nerf_lightning.config.quoting import escape_interpolations
 
     def job(cfg: "DictConfig") -> float | None:
         try:
             runtime: Any = HydraConfig.get().runtime
             plain: Any = OmegaConf.to_container(runtime)
             with read_write(runtime):  # Hydra does not escape the path that it puts there
-                runtime.output_dir = escape(plain["output_dir"])
+                runtime.output_dir = escape_interpolations(plain["output_dir"])
             return train_job(cfg)
         except Exception as error:
-            known = error if isinstance(error, OmegaConfBaseException) else find_cause(error)
+            known = error if isinstance(error, OmegaConfBaseException) else find_input_error(error)
             if known is None:
                 raise
-            remove_empty(Path(HydraConfig.get().runtime.output_dir))
-            fail(known)  # here, as Hydra would print a line of its own
+            remove_empty_folders(Path(HydraConfig.get().runtime.output_dir))
+            exit_with_error(known)  # here, as Hydra would print a line of its own
 
     def refuse(message: str) -> None:
         raise InputError("command line", "", message, "KEY=VALUE, or flags that --hydra-help lists")
@@ -102,8 +102,8 @@ def run_hydra(overrides: Sequence[str]) -> None:
         refuse("--experimental-rerun")
     for word in flags.overrides:
         if ("=" not in word and not word.startswith("~")) or os.path.exists(word):
-            todo = f"to train on photos: dataset=photos {shlex.quote(f'dataset.path={word}')}"
-            raise InputError("command line", "", word, "KEY=VALUE", todo)
+            hint = f"to train on photos: dataset=photos {shlex.quote(f'dataset.path={word}')}"
+            raise InputError("command line", "", word, "KEY=VALUE", hint)
     sys.argv[1:] = rewrite_overrides(overrides, flags.multirun)
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing a report and exiting with 1
     try:
@@ -125,9 +125,9 @@ def train_job(cfg: "DictConfig") -> float | None:
     from hydra.types import RunMode
     from omegaconf import OmegaConf, read_write
 
-    from nerf_lightning.config.literal import escape
     from nerf_lightning.config.options import check_run_options
-    from nerf_lightning.utils.signals import Interrupted
+    from nerf_lightning.config.quoting import escape_interpolations
+    from nerf_lightning.utils.signals import SignalInterrupt
 
     hydra: Any = HydraConfig.get()
     if hydra.mode == RunMode.MULTIRUN:
@@ -135,20 +135,20 @@ def train_job(cfg: "DictConfig") -> float | None:
 
         return run_job(cfg)
     check_run_options(cfg, hydra.runtime.choices)
-    from nerf_lightning.runs.owner import own_folder, owned
+    from nerf_lightning.runs.run_lock import lock_folder, lock_new_run_folder
     from nerf_lightning.training.train import train as train_run
 
     folder = Path(hydra.runtime.output_dir)
     try:
         if cfg.resume is not None:
-            with owned(folder):
+            with lock_folder(folder):
                 return train_run(cfg)
         timed = "${now:" in str(OmegaConf.to_container(hydra.run, resolve=False))
-        with own_folder(folder, cfg.overwrite, renamed=timed) as folder:
+        with lock_new_run_folder(folder, cfg.overwrite, allow_suffix=timed) as folder:
             with read_write(hydra):  # further processes of this run ask Hydra
-                hydra.run.dir = hydra.runtime.output_dir = escape(str(folder))
+                hydra.run.dir = hydra.runtime.output_dir = escape_interpolations(str(folder))
             return train_run(cfg)
-    except Interrupted as interrupted:
+    except SignalInterrupt as interrupted:
         if (folder / "checkpoints" / "last.ckpt").exists():
             argument = shlex.quote(f"resume={os.path.relpath(folder)}")
             interrupted.hint = f"continue with: nerf_lightning train {argument}"
@@ -162,28 +162,28 @@ def rewrite_overrides(words: Sequence[str], sweep: bool) -> list[str]:
     Raises:
         InputError: for a group that no run can do without, an experiment that is no YAML, and a run that is not there.
     """
-    from nerf_lightning.config.literal import FOLDER_KEYS, override_of, quote_texts
     from nerf_lightning.config.options import replace_nulls
+    from nerf_lightning.config.quoting import FOLDER_KEYS, make_override, quote_overrides
     from nerf_lightning.utils.parsing import read_yaml
 
     resumes = [word for word in words if word.startswith("resume=") and word not in ("resume=", "resume=null")]
     rewritten = []
     for word in replace_nulls(words):
         key, _, value = word.partition("=")
-        if key == "+experiment" and value.endswith(".yaml") and (file := user_path(value)).is_file():
+        if key == "+experiment" and value.endswith(".yaml") and (file := expand_user_path(value)).is_file():
             read_yaml(file, "an experiment in YAML")  # Hydra reads without limits
-            word = override_of(key, os.path.relpath(file.with_suffix(""), conf_dir() / "experiment"))
+            word = make_override(key, os.path.relpath(file.with_suffix(""), conf_dir() / "experiment"))
         elif key in FOLDER_KEYS and value.startswith("~"):
-            word = override_of(key, user_path(value))
+            word = make_override(key, expand_user_path(value))
         elif resumes and re.match(r"(?!hydra\.)\w+\.[\w.]+=", word):
             word = f"++{word}"  # conf/ composes another run: this sets also what only the resumed one has
         rewritten.append(word)
     if resumes:
-        folder = user_path(resumes[-1].removeprefix("resume="))
+        folder = expand_user_path(resumes[-1].removeprefix("resume="))
         if not folder.is_dir():
             raise InputError(folder, "", "no folder", "the folder of a run", "give resume=FOLDER")
-        rewritten.append(override_of("hydra.run.dir", folder.absolute()))
-    return quote_texts(rewritten, sweep)
+        rewritten.append(make_override("hydra.run.dir", folder.absolute()))
+    return quote_overrides(rewritten, sweep)
 
 
 def translate_error(error: Exception) -> InputError:
@@ -193,8 +193,8 @@ def translate_error(error: Exception) -> InputError:
         node = getattr(error.__cause__, "parent_node", None)
         known = [str(key) for key in node] if node is not None else []
         parent, dot, key = unknown[1].rpartition(".")
-        todo = suggest(key, known, parent + dot) or "--cfg job lists all"
-        return InputError("command line", unknown[1], "an unknown key", f"one of {', '.join(sorted(known))}", todo)
+        hint = suggest(key, known, parent + dot) or "--cfg job lists all"
+        return InputError("command line", unknown[1], "an unknown key", f"one of {', '.join(sorted(known))}", hint)
     if re.search(r"hydra/(launcher|sweeper)", line):
         line += "; joblib, submitit_local, submitit_slurm and optuna come with pip install 'nerf_lightning[sweeps]'"
     return InputError("command line", "", line, "what nerf_lightning train --help describes")

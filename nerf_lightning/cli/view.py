@@ -7,9 +7,9 @@ from cyclopts import Parameter
 
 from nerf_lightning.cli.command import Device, command
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.find import OUTPUTS, find_run, is_run
-from nerf_lightning.utils.options import AtLeast, AtMost, Count, Port
-from nerf_lightning.utils.signals import Interrupted
+from nerf_lightning.runs.find import OUTPUT_ROOT, find_run, is_run
+from nerf_lightning.utils.option_checks import Count, Ge, Le, Port
+from nerf_lightning.utils.signals import SignalInterrupt
 
 if TYPE_CHECKING:
     from nerf_lightning.view.page import Page
@@ -26,8 +26,8 @@ def view(
     /,
     *,
     resize: Count | Literal["auto"] | None = "auto",
-    holdout: Annotated[int, AtLeast(2)] = 8,
-    side: Annotated[int, AtLeast(64), AtMost(2048)] = 800,
+    holdout: Annotated[int, Ge(2)] = 8,
+    side: Annotated[int, Ge(64), Le(2048)] = 800,
     device: Device = "auto",
     host: str = "127.0.0.1",
     port: Port = 8080,
@@ -61,7 +61,7 @@ def view(
     try:
         print(f"{announce(page.name, host, port, page.port)}; Ctrl-C ends it", flush=True)
         page.run()
-    except (Interrupted, KeyboardInterrupt):
+    except (SignalInterrupt, KeyboardInterrupt):
         pass
     finally:
         page.stop()
@@ -72,7 +72,7 @@ def has_run(path: Path) -> bool:
     import zipfile
 
     path = path.expanduser()
-    if is_run(path) or path.absolute() == OUTPUTS.absolute():
+    if is_run(path) or path.absolute() == OUTPUT_ROOT.absolute():
         return True
     if not path.is_file():
         scene = any(path.glob("transforms*.json")) or any((path / name).exists() for name in ("images", "sparse"))
@@ -85,15 +85,15 @@ def has_run(path: Path) -> bool:
 
 
 def _open_run(source: Path, device: str, side: int, host: str, port: int) -> "Page":
-    from nerf_lightning.runs.data import data_again
     from nerf_lightning.runs.open import open_scene_run
-    from nerf_lightning.utils.device import the_device
+    from nerf_lightning.runs.reload import reload_data
+    from nerf_lightning.utils.device import resolve_device
     from nerf_lightning.view.field_page import FieldPage
 
-    found = open_scene_run(source, the_device(device))
+    found = open_scene_run(source, resolve_device(device))
     scene = None
     try:
-        scene = data_again(found.cfg, found.scene).scene
+        scene = reload_data(found.cfg, found.scene).scene
     except InputError as error:
         print(f"without photos: {error}", flush=True)
     return FieldPage(source.resolve().name, found.system, found.orbit, scene, host, port, side)

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from nerf_lightning.comparison.points import format_bytes, round_cost
-from nerf_lightning.utils.machine import CROWDED
+from nerf_lightning.utils.machine import MAX_BACKGROUND_LOAD
 
 MIN_SEEDS = 3
 """Runs below which a point on a frontier may be luck."""
@@ -50,10 +50,10 @@ def describe_point(point: Any) -> str:
 def list_caveats(points: pd.DataFrame) -> list[str]:
     """What weakens a comparison: a busy machine, few seeds."""
     caveats = []
-    busy = points[points["crowding"] > CROWDED]
+    busy = points[points["background_load"] > MAX_BACKGROUND_LOAD]
     if len(busy):
         caveats.append(
-            f"The machine was busy with something else, which took up to {busy['crowding'].max():.0%} of the threads: seconds"
+            f"The machine ran other work, which took up to {busy['background_load'].max():.0%} of the threads: seconds"
             f" are too long of {', '.join(busy['label'])}. Delete those runs and repeat them."
         )
     few = points[(points["frontier"] != "") & (points["runs"].map(len) < MIN_SEEDS)]

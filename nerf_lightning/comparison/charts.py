@@ -10,31 +10,38 @@ from matplotlib.patheffects import withStroke
 from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from nerf_lightning.comparison.points import COSTS, format_bytes, typical_run
-from nerf_lightning.drawing.ink import GREY, VERMILLION, assign_styles, pixels_of, readable, shortened
+from nerf_lightning.comparison.points import COSTS, find_median_run, format_bytes
+from nerf_lightning.drawing.style import (
+    GREY,
+    VERMILLION,
+    assign_styles,
+    rasterize_figure,
+    replace_missing_glyphs,
+    shorten,
+)
 
-WIDTH, HEIGHT, DPI = 4.8, 3.5, 172
+PANEL_WIDTH_IN, PANEL_HEIGHT_IN, DPI = 4.8, 3.5, 172
 """Of a panel, in inches, and pixels per inch."""
-MAX_NAMED = 8
+MAX_LABELS = 8
 """Points that are named each, and have a colour each; of more, those on the frontier are named, and methods have colours."""
 MAX_ROWS = 12
 """Configurations in the panel of qualities, the best."""
-MAX_TIME_RATIO = 30.0
+MAX_PUBLISHED_TIME_RATIO = 30.0
 """How many times the longest training of one's own the axis reaches, where publications took longer."""
 
 
 def draw_panels(points: pd.DataFrame, references: pd.DataFrame) -> list[UInt8[np.ndarray, "_ _ 3"]]:
     """The panel of qualities, then one for each cost that is known."""
-    kind = "label" if len(points) <= MAX_NAMED else "method"
+    kind = "label" if len(points) <= MAX_LABELS else "method"
     styles = assign_styles(sorted(points[kind]))
     points = points.assign(style=[styles[name] for name in points[kind]])
     figures = [draw_quality(points)]
     figures += [draw_cost(points, cost, references) for cost in COSTS if len(points) > 1 and points[cost].notna().any()]
-    return [pixels_of(figure) for figure in figures]
+    return [rasterize_figure(figure) for figure in figures]
 
 
 def make_panel(title: str) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(WIDTH, HEIGHT), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(PANEL_WIDTH_IN, PANEL_HEIGHT_IN), dpi=DPI, layout="constrained")
     axes = figure.add_subplot(axisbelow=True)
     axes.set_title(title, loc="left")
     axes.grid(color="0.9", linewidth=0.6)
@@ -54,7 +61,10 @@ def draw_quality(points: pd.DataFrame) -> Figure:
         axes.plot(point.psnr, row, marker, color=colour, markersize=8, markeredgecolor="white")
         axes.annotate(f"{point.psnr:.2f}", (point.psnr_max, row), (8, -3), textcoords="offset points", fontsize=8)
     axes.set_yticks(
-        range(len(shown)), [shortened(readable(name), 34) for name in shown["label"]], parse_math=False, fontsize=8.5
+        range(len(shown)),
+        [shorten(replace_missing_glyphs(name), 34) for name in shown["label"]],
+        parse_math=False,
+        fontsize=8.5,
     )
     for tick, collapsed in zip(axes.get_yticklabels(), shown["collapsed"], strict=True):
         tick.set_color(VERMILLION if collapsed else "black")
@@ -76,28 +86,28 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
         edge, low = (VERMILLION, point.psnr) if point.collapsed else ("white", point.psnr_min)
         axes.plot([x, x], [low, point.psnr_max], color=colour, linewidth=1.5)
         axes.scatter([x], [point.psnr], 55, colour, marker=marker, edgecolor=edge, linewidth=0.6, zorder=4)
-        if len(points) <= MAX_NAMED or point.Index in front.index:
-            texts.append(add_name(axes, point.label, x, point.psnr, colour))
-    reach, label = MAX_TIME_RATIO * placed[cost].max(), "published, other hardware"
+        if len(points) <= MAX_LABELS or point.Index in front.index:
+            texts.append(add_label(axes, point.label, x, point.psnr, colour))
+    reach, label = MAX_PUBLISHED_TIME_RATIO * placed[cost].max(), "published, other hardware"
     for one in references.itertuples() if training else ():
         x, inside = min(one.seconds, reach), one.seconds <= reach
         xs.append(x)
         axes.scatter([x], [one.psnr], 34, "none", marker="o" if inside else ">", edgecolor=GREY, label=label)
         time = f"{one.seconds / 3600:.1f} h" if one.seconds >= 3600 else f"{one.seconds / 60:.0f} min"
         name = one.name if inside else f"{one.name} ({time})"
-        texts.append(add_name(axes, name, x, one.psnr, GREY))
+        texts.append(add_label(axes, name, x, one.psnr, GREY))
         label = ""
-    if training and len(points) <= MAX_NAMED:
+    if training and len(points) <= MAX_LABELS:
         low, high = axes.get_ylim()
         for point in placed.itertuples():
-            curve = np.array(typical_run(point).curve).reshape(-1, 3)
+            curve = np.array(find_median_run(point).curve).reshape(-1, 3)
             axes.plot(curve[:, 0], curve[:, 2], color=point.style[0], linewidth=1, alpha=0.5)
         axes.set_ylim(low - 0.3 * (high - low), high)
     if len(front) > 1:
         axes.plot(front[cost], front["psnr"], drawstyle="steps-post", color="0.4", linewidth=1, label="Pareto frontier")
-    if len(points) > MAX_NAMED:
+    if len(points) > MAX_LABELS:
         for method, (colour, marker) in dict(zip(placed["method"], placed["style"], strict=True)).items():
-            axes.plot([], [], marker, color=colour, label=readable(method))
+            axes.plot([], [], marker, color=colour, label=replace_missing_glyphs(method))
     axes.set(xlabel=COSTS[cost], ylabel="held-out PSNR, dB")
     scale_costs(axes, cost, xs)
     if axes.get_legend_handles_labels()[0]:
@@ -120,7 +130,9 @@ def scale_costs(axes: Axes, cost: str, values: list[float]) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: write(value)))
 
 
-def add_name(axes: Axes, name: str, x: float, y: float, colour: str) -> Text:
-    text = axes.text(x, y, shortened(readable(name), 34), color=colour, fontsize=8, zorder=6, parse_math=False)
+def add_label(axes: Axes, name: str, x: float, y: float, colour: str) -> Text:
+    text = axes.text(
+        x, y, shorten(replace_missing_glyphs(name), 34), color=colour, fontsize=8, zorder=6, parse_math=False
+    )
     text.set_path_effects([withStroke(linewidth=2, foreground="white")])
     return text

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.index import Run, flat
-from nerf_lightning.utils.machine import crowding
+from nerf_lightning.runs.summaries import RunSummary, flatten_config
+from nerf_lightning.utils.machine import background_load
 from nerf_lightning.utils.parsing import read_yaml
 
 COSTS = {"train_seconds": "training time, s", "render_seconds": "rendering time, s per view", "bytes": "size"}
@@ -20,9 +20,11 @@ IGNORED_NAMES = ("seed", "path", "folder", "url", "download", "accelerator")
 """Last parts of options that differ between runs of one configuration, or belong to the conditions."""
 BACKGROUNDS = {"[0.0, 0.0, 0.0]": "black background", "[1.0, 1.0, 1.0]": "white background"}
 
-PUBLISHED = Path(__file__).with_name("published.yaml")
+PUBLISHED_FILE = Path(__file__).with_name("published.yaml")
 """Published figures, to stand beside one's own: never measured here, and always drawn as such."""
-FORMAT = "publications as in published.yaml: source, hardware, conditions, scenes: {SCENE: {METHOD: [dB, seconds]}}"
+REFERENCES_FORMAT = (
+    "publications as in published.yaml: source, hardware, conditions, scenes: {SCENE: {METHOD: [dB, seconds]}}"
+)
 
 
 class Conditions(NamedTuple):
@@ -38,7 +40,7 @@ class Conditions(NamedTuple):
     """First letters of the SHA-256 of the images and their split."""
 
 
-def conditions_of(run: Run) -> Conditions:
+def get_conditions(run: RunSummary) -> Conditions:
     """A run's conditions, from its results.json."""
     parts = (run.results.get("scene"), run.results.get("machine"))
     scene, machine = (part if isinstance(part, dict) else {} for part in parts)
@@ -57,15 +59,15 @@ def conditions_of(run: Run) -> Conditions:
     )
 
 
-def compute_points(runs: Sequence[Run]) -> list[tuple[Conditions, pd.DataFrame]]:
+def compute_points(runs: Sequence[RunSummary]) -> list[tuple[Conditions, pd.DataFrame]]:
     """Groups runs by their conditions and configuration, those with most points first.
 
     Columns: label, method, psnr (dB, median over runs, a collapsed one counting as minus infinity), psnr_min, psnr_max, the
-    medians train_seconds, render_seconds and bytes (nan where unknown), collapsed (how many), crowding (see
+    medians train_seconds, render_seconds and bytes (nan where unknown), collapsed (how many), background_load (see
     `utils/machine`), options, runs, and the costs of whose frontier a point is. Sorted by falling PSNR. A configuration of
     which half of the runs or more collapsed makes no point, nor do runs without a figure.
     """
-    table = pd.DataFrame([make_record(run) for run in runs if has_figures(run)])
+    table = pd.DataFrame([make_record(run) for run in runs if has_metrics(run)])
     found = []
     for conditions, group in table.groupby("conditions") if len(table) else ():
         points = group.groupby("key", sort=False).agg(
@@ -76,7 +78,7 @@ def compute_points(runs: Sequence[Run]) -> list[tuple[Conditions, pd.DataFrame]]
             psnr_max=("psnr", "max"),
             **{cost: (cost, "median") for cost in COSTS},
             collapsed=("psnr", lambda psnr: int(np.isneginf(psnr).sum())),
-            crowding=("crowding", "max"),
+            background_load=("background_load", "max"),
             options=("options", "first"),
             runs=("run", list),
         )
@@ -89,33 +91,35 @@ def compute_points(runs: Sequence[Run]) -> list[tuple[Conditions, pd.DataFrame]]
     return sorted(found, key=lambda pair: -len(pair[1]))
 
 
-def has_figures(run: Run) -> bool:
+def has_metrics(run: RunSummary) -> bool:
     """Whether a run can be compared."""
-    return run.psnr is not None and (run.figure("train_seconds") or 0) > 0
+    return run.psnr is not None and (run.get_metric("train_seconds") or 0) > 0
 
 
-def make_record(run: Run) -> dict[str, Any]:
+def make_record(run: RunSummary) -> dict[str, Any]:
     """A run as a row."""
-    method, options = str(run.results.get("method") or run.option("method")), options_of(run)
+    method, options = str(run.results.get("method") or run.get_option("method")), collect_options(run)
     return {
         "run": run,
-        "conditions": conditions_of(run),
+        "conditions": get_conditions(run),
         "key": f"{method} {options}",
-        "label": str(run.option("recipe") or method),
+        "label": str(run.get_option("recipe") or method),
         "method": method,
         "psnr": -np.inf if run.status == "collapsed" else run.psnr,
-        "train_seconds": run.figure("train_seconds"),
-        "render_seconds": run.figure("render_seconds_per_view") or np.nan,
-        "bytes": run.figure("artifact_bytes") or np.nan,
-        "crowding": crowding(run.results),
+        "train_seconds": run.get_metric("train_seconds"),
+        "render_seconds": run.get_metric("render_seconds_per_view") or np.nan,
+        "bytes": run.get_metric("artifact_bytes") or np.nan,
+        "background_load": background_load(run.results),
         "options": options,
     }
 
 
-def options_of(run: Run) -> dict[str, Any]:
+def collect_options(run: RunSummary) -> dict[str, Any]:
     """The options that shape a run's result, with dotted keys; the folder stands for them where they cannot be read."""
     plain = {key: value for key, value in run.config.items() if key not in IGNORED_OPTIONS}
-    options = {key: value for key, value in flat(plain).items() if key.rsplit(".", 1)[-1] not in IGNORED_NAMES}
+    options = {
+        key: value for key, value in flatten_config(plain).items() if key.rsplit(".", 1)[-1] not in IGNORED_NAMES
+    }
     return options or {"folder": str(run.folder)}
 
 
@@ -146,7 +150,7 @@ def find_frontier(costs: pd.Series, gains: pd.Series) -> pd.Index:
     return table.index[best_so_far & cheapest]
 
 
-def typical_run(point: Any) -> Run:
+def find_median_run(point: Any) -> RunSummary:
     """The run nearest to a point's median."""
     return min(point.runs, key=lambda run: abs(run.psnr - point.psnr))
 
@@ -161,7 +165,7 @@ def read_references(file: Path) -> pd.DataFrame:
     Raises:
         InputError: where it cannot be read, or an entry lacks something or has an impossible value.
     """
-    publications, rows = read_yaml(file, FORMAT), []
+    publications, rows = read_yaml(file, REFERENCES_FORMAT), []
     try:
         for entry in publications.values():
             origin = f"{entry['conditions']}; {entry['hardware']}; {entry['source']}"
@@ -171,5 +175,5 @@ def read_references(file: Path) -> pd.DataFrame:
                         raise ValueError(f"{name}: {psnr} dB, {seconds} s")
                     rows.append((str(name), psnr, seconds, str(scene), origin))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(file, "", f"{type(error).__name__}: {error}", FORMAT) from error
+        raise InputError(file, "", f"{type(error).__name__}: {error}", REFERENCES_FORMAT) from error
     return pd.DataFrame(rows, columns=["name", "psnr", "seconds", "scene", "origin"])

@@ -18,30 +18,30 @@ from omegaconf.errors import ConfigKeyError
 
 from nerf_lightning.callbacks import Budget, Evaluation
 from nerf_lightning.cameras import Bounds, Cameras
-from nerf_lightning.config.limits import limits_of
-from nerf_lightning.config.literal import escape
+from nerf_lightning.config.limits import get_limits
+from nerf_lightning.config.quoting import escape_interpolations
+from nerf_lightning.datamodules import build_photo_data
 from nerf_lightning.dataset import DataModule, PixelDataModule, RayDataModule
-from nerf_lightning.dataset.resize import AUTO, auto_resize
+from nerf_lightning.dataset.resize import AUTO, compute_auto_resize
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.renderer.background import Background
 from nerf_lightning.sampler import Sampler
-from nerf_lightning.sources import from_photos
 from nerf_lightning.system import NeRF2D, NeRF3D, System
-from nerf_lightning.system.compiled import BACKEND
-from nerf_lightning.utils.device import CPU, the_device
-from nerf_lightning.utils.options import check_options
+from nerf_lightning.system.torch_compile import COMPILE_BACKEND
+from nerf_lightning.utils.device import CPU, resolve_device
+from nerf_lightning.utils.option_checks import check_options
 
-KNOWN = ("cpu", "cuda", "mps")
+LIGHTNING_DEVICES = ("cpu", "cuda", "mps")
 """Devices that Lightning knows; for any other it would silently take the CPU."""
 
-PRECISIONS = ("32-true", "16-mixed", "bf16-mixed", 32, "32", 16, "16", "bf16")
+SUPPORTED_PRECISIONS = ("32-true", "16-mixed", "bf16-mixed", 32, "32", 16, "16", "bf16")
 """Lightning's that training takes: the kernels, and what the renderer integrates, are in single precision."""
 
 
-def make(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
+def instantiate_node(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
     """Builds what the node at `path` describes, passing `extra`; errors name the config's keys.
 
     Args:
@@ -53,14 +53,16 @@ def make(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
     Raises:
         InputError: where the key is missing, or its target refuses or does not know an option, or makes something else.
     """
-    target, node = target_of(cfg, path), OmegaConf.select(cfg, path)
+    target, node = resolve_target(cfg, path), OmegaConf.select(cfg, path)
     missing = sorted(OmegaConf.missing_keys(node))
     if missing:
         raise InputError("config", missing[0], "nothing", "a value", f"give {missing[0]}=...")
     late = node.get("_partial_") or False
-    check_options(path, target, options_of(node), extra, complete=not late)
+    check_options(path, target, get_options(node), extra, require_all=not late)
     # Hydra only binds the options: it would turn dataclasses among `extra` into configs.
-    literal = escape(escape(resolved(node)))  # Hydra resolves what it is given twice
+    literal = escape_interpolations(
+        escape_interpolations(resolve_config(node))
+    )  # Hydra resolves what it is given twice
     bound = hydra.utils.instantiate(literal, _partial_=True, _convert_="all")
     try:
         # What Hydra binds it examines at every call, which a training step would pay for: once is enough.
@@ -75,9 +77,9 @@ def make(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> Any:
     return made
 
 
-def options_of(node: DictConfig) -> dict[str, Any]:
+def get_options(node: DictConfig) -> dict[str, Any]:
     """A node's options, without what is Hydra's."""
-    return {key: value for key, value in resolved(node).items() if key not in ("_target_", "_partial_")}
+    return {key: value for key, value in resolve_config(node).items() if key not in ("_target_", "_partial_")}
 
 
 def check_groups(cfg: DictConfig) -> None:
@@ -90,10 +92,10 @@ def check_groups(cfg: DictConfig) -> None:
     groups = ["dataset", "model", "sampler", "renderer", "optimizer", "schedule", "refine", "logger", "trainer"]
     for path in [*groups, *(f"callbacks.{name}" for name in cfg.get("callbacks") or {})]:
         if isinstance(node := OmegaConf.select(cfg, path), DictConfig):
-            check_options(path, target_of(cfg, path), options_of(node), complete=False)
+            check_options(path, resolve_target(cfg, path), get_options(node), require_all=False)
 
 
-def target_of(cfg: DictConfig, path: str) -> Any:
+def resolve_target(cfg: DictConfig, path: str) -> Any:
     """The class or function that the node at `path` names.
 
     Raises:
@@ -109,20 +111,20 @@ def target_of(cfg: DictConfig, path: str) -> Any:
         raise InputError("config", f"{path}._target_", str(error), "an importable class or function") from error
 
 
-def resolved(cfg: DictConfig) -> dict[str, Any]:
+def resolve_config(cfg: DictConfig) -> dict[str, Any]:
     """A configuration as plain containers, interpolations filled in."""
     plain = OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(plain, dict)  # a DictConfig gives nothing else
     return {str(key): value for key, value in plain.items()}
 
 
-def device_of(cfg: DictConfig) -> torch.device:
+def resolve_run_device(cfg: DictConfig) -> torch.device:
     """The device that a run asks for, by its trainer.
 
     Raises:
         InputError: where it is not there.
     """
-    return the_device(str(OmegaConf.select(cfg, "trainer.accelerator", default="auto")))
+    return resolve_device(str(OmegaConf.select(cfg, "trainer.accelerator", default="auto")))
 
 
 def build_data(cfg: DictConfig, path: str | Path | None = None) -> DataModule:
@@ -130,58 +132,62 @@ def build_data(cfg: DictConfig, path: str | Path | None = None) -> DataModule:
     chosen = {}
     if cfg.dataset.get("resize") == AUTO:
         limits = build_budget(cfg)
-        chosen["resize"] = auto_resize(limits.limit_seconds, limits.steps, device_of(cfg), torch.get_num_threads())
-    source = cfg if path is None else with_photos(cfg, path)
-    return make(source, "dataset", RayDataModule, PixelDataModule, **chosen)
+        chosen["resize"] = compute_auto_resize(
+            limits.max_seconds, limits.steps, resolve_run_device(cfg), torch.get_num_threads()
+        )
+    source = cfg if path is None else replace_photos(cfg, path)
+    return instantiate_node(source, "dataset", RayDataModule, PixelDataModule, **chosen)
 
 
-def with_photos(cfg: DictConfig, path: str | Path) -> DictConfig:
+def replace_photos(cfg: DictConfig, path: str | Path) -> DictConfig:
     """A copy of a configuration that reads other photos: those at `path`, in place of a built-in scene too."""
     moved = copy.deepcopy(cfg)
-    if "path" not in inspect.signature(target_of(cfg, "dataset")).parameters:
-        shared = {key: value for key, value in cfg.dataset.items() if key in inspect.signature(from_photos).parameters}
-        moved.dataset = {"_target_": "nerf_lightning.sources.from_photos", **shared}
-    OmegaConf.update(moved, "dataset.path", escape(str(path)), force_add=True)
+    if "path" not in inspect.signature(resolve_target(cfg, "dataset")).parameters:
+        shared = {
+            key: value for key, value in cfg.dataset.items() if key in inspect.signature(build_photo_data).parameters
+        }
+        moved.dataset = {"_target_": "nerf_lightning.datamodules.build_photo_data", **shared}
+    OmegaConf.update(moved, "dataset.path", escape_interpolations(str(path)), force_add=True)
     return moved
 
 
 def build_field(cfg: DictConfig, kind: type, dimensions: str, **extra: Any) -> Any:
     """The field, if it has as many dimensions as the data."""
-    found = target_of(cfg, "model") if cfg.get("model") is not None else None
+    found = resolve_target(cfg, "model") if cfg.get("model") is not None else None
     if not (inspect.isclass(found) and issubclass(found, kind)):
         name = getattr(found, "__name__", "nothing")
         advice = "model=hashgrid or model=mlp" if kind is Field else "model=hashgrid2d or model=picture_mlp"
         raise InputError("config", "model", name, f"a field of {dimensions} for this dataset", f"choose {advice}")
-    return make(cfg, "model", kind, **extra)
+    return instantiate_node(cfg, "model", kind, **extra)
 
 
-def build_system(cfg: DictConfig, frame: "Frame", device: torch.device = CPU) -> System:
+def build_system(cfg: DictConfig, frame: "Metadata", device: torch.device = CPU) -> System:
     """The LightningModule, NeRF3D for a scene's frame and NeRF2D for a picture's: on the CPU, with the limits of `device`."""
-    optimizer = make(cfg, "optimizer")
+    optimizer = instantiate_node(cfg, "optimizer")
     try:
         optimizer([torch.zeros(1)])  # so that a negative rate is reported now, not when training starts
     except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
-    chunk = limits_of(cfg, device).chunk
-    common = {"optimizer": optimizer, "schedule": make(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
-    common["backend"] = BACKEND if cfg.compile else None
-    if isinstance(frame, PictureFrame):
+    chunk = get_limits(cfg, device).chunk_samples
+    common = {"optimizer": optimizer, "schedule": instantiate_node(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
+    common["compile_backend"] = COMPILE_BACKEND if cfg.compile else None
+    if isinstance(frame, ImageMetadata):
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=(frame.width, frame.height)), **common)
     bounds = frame.bounds
     field = build_field(cfg, Field, "three coordinates", bounds=bounds)
-    sampler = make(cfg, "sampler", Sampler, bounds=bounds, chunk=chunk)
+    sampler = instantiate_node(cfg, "sampler", Sampler, bounds=bounds, chunk=chunk)
     seen = {"half_size": float(bounds.half_size.min()), "unbounded": bounds.unbounded, "alpha": frame.alpha}
-    renderer = make(cfg, "renderer", VolumeRenderer, scene_background=frame.background, **seen)
+    renderer = instantiate_node(cfg, "renderer", VolumeRenderer, scene_background=frame.background, **seen)
     corrections = None
     if frame.cameras is not None:
         check_background(cfg, frame, renderer.background)
         if cfg.get("refine") is not None:
             photographed = {"cameras": frame.cameras, "bounds": frame.bounds, "exposures": frame.exposures}
-            corrections = make(cfg, "refine", Corrections, **photographed)
+            corrections = instantiate_node(cfg, "refine", Corrections, **photographed)
     return NeRF3D(field, sampler, renderer, **common, corrections=corrections)
 
 
-def check_background(cfg: DictConfig, frame: "SceneFrame", background: Background) -> None:
+def check_background(cfg: DictConfig, frame: "SceneMetadata", background: Background) -> None:
     """Photos without alpha show one background colour; with another, the field would learn that colour as a wall."""
     is_same = torch.allclose(background.color, torch.tensor(frame.background), atol=1e-3)
     if not frame.alpha and (background.is_random or not is_same):
@@ -189,13 +195,13 @@ def check_background(cfg: DictConfig, frame: "SceneFrame", background: Backgroun
         raise InputError("config: renderer.background", "", str(cfg.renderer.background), expected)
 
 
-def corrects_poses(cfg: DictConfig) -> bool:
+def has_pose_refinement(cfg: DictConfig) -> bool:
     """Whether training corrects the poses, or may."""
     return bool((cfg.get("refine") or {}).get("poses"))
 
 
 @dataclass(frozen=True)
-class SceneFrame:
+class SceneMetadata:
     """What a 3D system takes from its scene: where it is, and the colour behind it."""
 
     bounds: Bounds
@@ -209,51 +215,55 @@ class SceneFrame:
 
 
 @dataclass(frozen=True)
-class PictureFrame:
+class ImageMetadata:
     """What a 2D system takes from its picture: pixels along each side."""
 
     width: int
     height: int
 
 
-Frame = SceneFrame | PictureFrame
+Metadata = SceneMetadata | ImageMetadata
 
 
-def frame_of(data: DataModule) -> Frame:
+def get_metadata(data: DataModule) -> Metadata:
     """What a system takes from the data."""
     if isinstance(data, PixelDataModule):
-        return PictureFrame(*data.scene.size)
+        return ImageMetadata(*data.scene.size)
     bounds, train = data.scene.bounds, data.scene.train
-    pixel = train.cameras.pixel_width(bounds.centre)
+    pixel_footprint = train.cameras.pixel_footprint(bounds.centre)
     seen = train.cameras, train.channels == 4, train.exposures
-    return SceneFrame(replace(bounds, pixel=pixel or None), data.scene.background, *seen)
+    return SceneMetadata(replace(bounds, pixel_footprint=pixel_footprint or None), data.scene.background, *seen)
 
 
-def budget_options(cfg: DictConfig) -> dict[str, Any]:
+def get_budget_options(cfg: DictConfig) -> dict[str, Any]:
     """The user's limits, or the experiment's own if the user gives none."""
-    budget = resolved(cfg.budget)
+    budget = resolve_config(cfg.budget)
     default = budget.pop("default") if isinstance(budget.get("default"), dict) else {}
     return budget if any(budget.get(key) is not None for key in default) else {**budget, **default}
 
 
 def build_budget(cfg: DictConfig) -> Budget:
     """How long to train."""
-    limits = budget_options(cfg)
+    limits = get_budget_options(cfg)
     check_options("budget", Budget, limits)
     return Budget(**limits)
 
 
 def build_trainer(cfg: DictConfig, folder: Path, device: torch.device) -> L.Trainer:
     """The Trainer with its callbacks, on a device, writing into `folder`."""
-    logger = make(cfg, "logger", Logger, save_dir=folder) if cfg.get("logger") is not None else False
+    logger = instantiate_node(cfg, "logger", Logger, save_dir=folder) if cfg.get("logger") is not None else False
     chosen = [name for name, node in (cfg.get("callbacks") or {}).items() if node is not None]
-    callbacks = [make(cfg, f"callbacks.{name}", L.Callback) for name in chosen]
+    callbacks = [instantiate_node(cfg, f"callbacks.{name}", L.Callback) for name in chosen]
     # The budget comes first, as the others read its clock, and figures come before pictures.
     callbacks = [build_budget(cfg), Evaluation(), *callbacks]
     precision = OmegaConf.select(cfg, "trainer.precision")
-    if precision not in (None, *PRECISIONS):
-        raise InputError("config", "trainer.precision", repr(precision), f"one of {', '.join(map(str, PRECISIONS))}")
+    if precision not in (None, *SUPPORTED_PRECISIONS):
+        raise InputError(
+            "config", "trainer.precision", repr(precision), f"one of {', '.join(map(str, SUPPORTED_PRECISIONS))}"
+        )
     where: dict[str, Any] = {"accelerator": device.type, "enable_checkpointing": False}  # callbacks/checkpoints does it
-    if device.type not in KNOWN:
+    if device.type not in LIGHTNING_DEVICES:
         where["strategy"] = SingleDeviceStrategy(device)
-    return make(cfg, "trainer", L.Trainer, callbacks=callbacks, logger=logger, default_root_dir=folder, **where)
+    return instantiate_node(
+        cfg, "trainer", L.Trainer, callbacks=callbacks, logger=logger, default_root_dir=folder, **where
+    )

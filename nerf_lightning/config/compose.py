@@ -7,16 +7,16 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config import conf_dir, resolvers  # noqa: F401  (conf/ uses the resolvers)
-from nerf_lightning.config.literal import escape
 from nerf_lightning.config.options import check_run_options, replace_nulls
+from nerf_lightning.config.quoting import escape_interpolations
 
 
-def composed(overrides: list[str], folder: Path) -> DictConfig:
+def compose_config(overrides: list[str], folder: Path) -> DictConfig:
     """The configuration that a command line would train with, with `folder` as the run's."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         cfg = compose("config", replace_nulls(overrides), return_hydra_config=True)
     with open_dict(cfg):
-        cfg.hydra.runtime.output_dir = escape(str(folder))
+        cfg.hydra.runtime.output_dir = escape_interpolations(str(folder))
     HydraConfig.instance().set_config(cfg)
     own = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
     check_run_options(own, cfg.hydra.runtime.choices)

@@ -7,20 +7,20 @@ import yaml
 from omegaconf import DictConfig
 
 from nerf_lightning.config import conf_dir
-from nerf_lightning.utils.options import Count, check_options
+from nerf_lightning.utils.option_checks import Count, check_options
 
 
 @dataclass(frozen=True)
 class Limits:
     """The keys of conf/devices/*.yaml, and of a run's `limits`."""
 
-    batch: Count
+    batch_scale: Count
     """Factor on the rays and samples of a training step."""
-    chunk: Count
+    chunk_samples: Count
     """Samples rendered at once."""
 
 
-def limits_of(cfg: DictConfig, device: torch.device) -> Limits:
+def get_limits(cfg: DictConfig, device: torch.device) -> Limits:
     """A run's own limits, or else the defaults of its device.
 
     Raises:

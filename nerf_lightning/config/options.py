@@ -10,15 +10,15 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.options import AtMost, Count, Seed, check_options
+from nerf_lightning.utils.option_checks import Count, Le, Seed, check_options
 
 OPTIONAL_GROUPS = ("callbacks", "logger", "recipe", "refine", "renderer", "sampler")
 """Groups that a run can do without: a 2D field has no sampler and no renderer."""
-NONE = "none"
+NONE_OPTION = "none"
 """Name of the option of such a group that sets nothing, as Hydra takes no null for a group."""
 
 for _group in OPTIONAL_GROUPS:
-    ConfigStore.instance().store(name=NONE, node={}, group=_group, package="_global_", provider="nerf_lightning")
+    ConfigStore.instance().store(name=NONE_OPTION, node={}, group=_group, package="_global_", provider="nerf_lightning")
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class RunOptions:
     method: str
     recipe: str | None
     seed: Seed
-    threads: Annotated[Count, AtMost(1024)] | None
+    threads: Annotated[Count, Le(1024)] | None
     device: str
     kernels: str
     compile: bool
@@ -65,7 +65,7 @@ def replace_nulls(arguments: Sequence[str]) -> list[str]:
             if group not in OPTIONAL_GROUPS:
                 options = ", ".join(sorted(file.stem for file in (conf_dir() / group).glob("*.yaml")))
                 raise InputError("command line", group, "null", f"one of {options}")
-            argument = f"{key}={','.join(NONE if one == 'null' else one for one in values)}"
+            argument = f"{key}={','.join(NONE_OPTION if one == 'null' else one for one in values)}"
         replaced.append(argument)
     return replaced
 
@@ -82,7 +82,7 @@ def check_run_options(cfg: DictConfig, choices: Mapping[str, str | None]) -> Non
     """
     with open_dict(cfg):
         for group in OPTIONAL_GROUPS:
-            if choices.get(group) == NONE and group != "recipe":
+            if choices.get(group) == NONE_OPTION and group != "recipe":
                 cfg[group] = None
     text, plain = str(OmegaConf.to_container(cfg)), OmegaConf.to_container(cfg, resolve=True)
     assert isinstance(plain, dict)  # of a DictConfig

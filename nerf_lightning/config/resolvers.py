@@ -9,16 +9,16 @@ from omegaconf import OmegaConf
 
 from nerf_lightning.config import conf_dir
 
-LONGEST = 120
+MAX_SLUG_CHARS = 120
 """Most letters in a folder's name."""
 
 
-def slug(text: str) -> str:
+def slugify(text: str) -> str:
     """Text as the name of a folder. Long text is cut and ends in a hash of the whole, so that names stay different."""
     plain = "".join(c if c.isalnum() or c in "=.,_-+" else "-" for c in text) or "all"
-    if len(plain) <= LONGEST:
+    if len(plain) <= MAX_SLUG_CHARS:
         return plain
-    return f"{plain[: LONGEST - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+    return f"{plain[: MAX_SLUG_CHARS - 9]}-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
 def sweep_folder(arguments: Sequence[str]) -> str:
@@ -32,7 +32,7 @@ def sweep_folder(arguments: Sequence[str]) -> str:
     experiment = given.pop("experiment", "run")
     name = given.pop("name", experiment)
     given.pop("overwrite", None)
-    return f"outputs/{slug(name)}/{slug('_'.join(['sweep', *(f'{k}={v}' for k, v in sorted(given.items()))]))}"
+    return f"outputs/{slugify(name)}/{slugify('_'.join(['sweep', *(f'{k}={v}' for k, v in sorted(given.items()))]))}"
 
 
 def fixed_keys(arguments: Sequence[str]) -> list[str]:
@@ -44,22 +44,22 @@ def fixed_keys(arguments: Sequence[str]) -> list[str]:
 
 def job_name(overrides: Sequence[str], fixed: Sequence[str]) -> str:
     """The name of a job: its overrides, without those that are the same for all jobs."""
-    return slug(",".join(sorted(one for one in overrides if one.lstrip("+~").partition("=")[0] not in fixed)))
+    return slugify(",".join(sorted(one for one in overrides if one.lstrip("+~").partition("=")[0] not in fixed)))
 
 
-def recipe_of(recipe: str | None, model: str) -> str | None:
+def recipe_name(recipe: str | None, model: str) -> str | None:
     """The recipe, if the model chosen is the recipe's, after which it is named; None for another one, as in
     `+experiment=lego model=mlp`. A user's own, in another folder, may have any name."""
     shipped = (conf_dir() / "recipe" / f"{recipe}.yaml").is_file()
     return None if shipped and not str(recipe).startswith(f"{model}_") else recipe
 
 
-def register() -> None:
+def register_resolvers() -> None:
     """Registers the resolvers. Values from the command line are cached, so that jobs keep them."""
     OmegaConf.register_new_resolver("sweep_folder", lambda: sweep_folder(sys.argv[1:]), use_cache=True, replace=True)
     OmegaConf.register_new_resolver("fixed_keys", lambda: fixed_keys(sys.argv[1:]), use_cache=True, replace=True)
     OmegaConf.register_new_resolver("job_name", job_name, replace=True)
-    OmegaConf.register_new_resolver("recipe_of", recipe_of, replace=True)
+    OmegaConf.register_new_resolver("recipe_name", recipe_name, replace=True)
 
 
-register()  # on import, as the processes of a sweep import nothing else of the command line
+register_resolvers()  # on import, as the processes of a sweep import nothing else of the command line

@@ -1,14 +1,14 @@
 """Stage 2, dataset: photos and poses become a Scene, whatever format they come in."""
 
-from nerf_lightning.dataset.extent import estimate_bounds
 from nerf_lightning.dataset.formats.npz import load_npz, save_npz
 from nerf_lightning.dataset.formats.transforms import load_blender, load_transforms
-from nerf_lightning.dataset.open import open_scene
-from nerf_lightning.dataset.picture import builtin_picture, load_picture
-from nerf_lightning.dataset.pixels import Picture, PictureBatch, PixelBatch, PixelDataModule, pixel_grid
-from nerf_lightning.dataset.rays import RayBatch, RayDataModule, ViewBatch
+from nerf_lightning.dataset.photo_loading import PhotoLoadOptions
+from nerf_lightning.dataset.picture import load_picture, make_builtin_picture
+from nerf_lightning.dataset.pixel_datamodule import Picture, PictureBatch, PixelBatch, PixelDataModule, pixel_grid
+from nerf_lightning.dataset.ray_datamodule import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
-from nerf_lightning.dataset.shots import PhotoLoadOptions
+from nerf_lightning.dataset.scene_bounds import estimate_bounds
+from nerf_lightning.dataset.scene_reader import open_scene
 from nerf_lightning.dataset.views import Views
 
 DataModule = RayDataModule | PixelDataModule
@@ -27,7 +27,7 @@ __all__ = [
     "ViewBatch",
     "Scene",
     "Views",
-    "builtin_picture",
+    "make_builtin_picture",
     "estimate_bounds",
     "load_blender",
     "load_transforms",

@@ -9,15 +9,15 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, UInt8
 
-from nerf_lightning.dataset.extent import take_border
-from nerf_lightning.dataset.formats.decode import read_pixels
-from nerf_lightning.dataset.formats.names import MASK_FOLDERS, fold_name, walk_images
+from nerf_lightning.dataset.formats.file_names import MASK_FOLDERS, normalize_name, walk_images
+from nerf_lightning.dataset.formats.image_files import read_pixels
+from nerf_lightning.dataset.scene_bounds import extract_border
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.text import join_truncated
 
 log = logging.getLogger(__name__)
 
-MIN_KEPT = 128
+MASK_THRESHOLD = 128
 """Brightness, or alpha, from which a mask keeps a pixel: white is kept, as nerfstudio and COLMAP have it."""
 MAX_NAMED = 4
 """Masks that a message names."""
@@ -47,7 +47,7 @@ def find_masks(photos: Sequence[Path], root: Path) -> list[Path | None]:
         return [None] * len(photos)
     masks = [(fold_mask(file.relative_to(folder)), file) for file in walk_images(folder)]
     common = Path(os.path.commonpath([photo.parent for photo in photos]))
-    found = [match_mask(folder, fold_name(str(photo.relative_to(common))), photo, masks) for photo in photos]
+    found = [match_mask(folder, normalize_name(str(photo.relative_to(common))), photo, masks) for photo in photos]
     owners: dict[Path, Path] = {}
     for photo, mask in zip(photos, found, strict=True):
         if mask is not None and (other := owners.setdefault(mask, photo)) != photo:
@@ -69,7 +69,7 @@ def _mask_parents(photos: Sequence[Path], root: Path) -> list[Path]:
 
 def fold_mask(path: Path) -> tuple[str, ...]:
     """The folded parts of a mask's path; COLMAP appends an extension to the photo's: `a.jpg.png` becomes `a`."""
-    return fold_name("/".join(fold_name(path.as_posix())))
+    return normalize_name("/".join(normalize_name(path.as_posix())))
 
 
 def match_mask(
@@ -109,7 +109,7 @@ def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.nda
     """
     pixels = read_pixels(path)
     grey = pixels[..., 3] if pixels.shape[2] == 4 else pixels.max(axis=2)
-    mask = np.where(grey >= MIN_KEPT, 255, 0).astype(np.uint8)
+    mask = np.where(grey >= MASK_THRESHOLD, 255, 0).astype(np.uint8)
     mask = 255 - mask if invert else mask
     way = cv2.INTER_AREA if mask.shape[1] >= width and mask.shape[0] >= height else cv2.INTER_NEAREST
     return np.asarray(cv2.resize(mask, (width, height), interpolation=way), np.uint8)
@@ -117,7 +117,7 @@ def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.nda
 
 def is_cut_out_by_mask(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray, "H W"]) -> bool:
     """Whether what a mask leaves out is most of the photo's border, and of one colour: its subject is cut out already."""
-    if take_border(kept).mean() > 0.5:
+    if extract_border(kept).mean() > 0.5:
         return False
     masked = image[..., :3][~kept]
     middle = np.median(masked, axis=0)
@@ -130,4 +130,4 @@ def is_inverted(masks: Sequence[Bool[np.ndarray, "_ _"]]) -> bool:
     small = [cv2.resize(kept.astype(np.float32), grid, interpolation=cv2.INTER_AREA) for kept in masks]
     kept = np.mean(small, axis=0)
     quarter = CELLS_PER_SIDE // 4
-    return bool(kept[quarter:-quarter, quarter:-quarter].min() < 0.3 and take_border(kept).mean() > 0.7)
+    return bool(kept[quarter:-quarter, quarter:-quarter].min() < 0.3 and extract_border(kept).mean() > 0.7)

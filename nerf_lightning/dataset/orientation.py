@@ -4,7 +4,7 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from nerf_lightning.dataset.formats.decode import image_header, read_header
+from nerf_lightning.dataset.formats.image_files import read_header, read_image_size
 
 log = logging.getLogger(__name__)
 
@@ -30,9 +30,9 @@ def choose_orientations(
     chosen: list[bool] = []
     others = 0
     for photo, size in zip(photos, stated, strict=True):
-        shapes = [image_header(photo, turn)[:2] for turn in (False, True)]
+        shapes = [read_image_size(photo, turn)[:2] for turn in (False, True)]
         has_turn = read_header(photo).orientation != 1
-        fits_stored, fits_upright = (size is None or has_shape(shape, size) for shape in shapes)
+        fits_stored, fits_upright = (size is None or has_same_aspect(shape, size) for shape in shapes)
         chosen.append(has_turn and (orientation == "exif" or (orientation == "auto" and fits_upright > fits_stored)))
         others += has_turn and orientation == "auto" and fits_upright and fits_stored
     turned = "%s: %d photos are turned as their EXIF orientation says, so that they fit their cameras"
@@ -45,7 +45,7 @@ def choose_orientations(
     return chosen
 
 
-def has_shape(size: tuple[float, float], stated: tuple[float, float]) -> bool:
+def has_same_aspect(size: tuple[float, float], stated: tuple[float, float]) -> bool:
     """Whether a photo of one size may be that of another size, enlarged or reduced."""
     (width, height), (other_width, other_height) = size, stated
     off = max(abs(other_width * height / other_height - width), abs(other_height * width / other_width - height))

@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.dataset.formats.decode import read_pixels
+from nerf_lightning.dataset.formats.image_files import read_pixels
 
 Plane = Float[np.ndarray, "H W"]
 Colours = Float[np.ndarray, "H W 3"]
-SUN = (0.66, 0.30)
+SUN_POSITION = (0.66, 0.30)
 """Where the built-in picture's sun stands, as a share of its width and height."""
 
 
@@ -28,7 +28,7 @@ def load_picture(path: Path) -> UInt8[Tensor, "H W 3"]:
     return torch.from_numpy(pixels)
 
 
-def builtin_picture(size: int = 256) -> UInt8[Tensor, "size size 3"]:
+def make_builtin_picture(size: int = 256) -> UInt8[Tensor, "size size 3"]:
     """A sunset over water: smooth sky, sharp sun and hills, and ripples ever finer towards the horizon.
 
     Deterministic; it has detail at all scales, so that what a field cannot represent shows.
@@ -37,7 +37,7 @@ def builtin_picture(size: int = 256) -> UInt8[Tensor, "size size 3"]:
     grid = (np.arange(fine) + 0.5) / fine
     x, y = np.meshgrid(grid, grid)
     horizon = 0.62
-    picture = _sky(x, y, horizon)
+    picture = _draw_sky(x, y, horizon)
     for height, swing, seed, colour in (
         (0.17, 0.085, 1.0, (0.45, 0.25, 0.50)),
         (0.09, 0.060, 2.3, (0.28, 0.15, 0.40)),
@@ -45,24 +45,24 @@ def builtin_picture(size: int = 256) -> UInt8[Tensor, "size size 3"]:
     ):
         ridge = horizon - height - swing * sum(np.sin(2**k * 3.1 * x + seed * (k + 1)) / 1.7**k for k in range(6)) / 2
         picture = np.where((y > ridge)[..., None], np.array(colour), picture)
-    picture = np.where((y > horizon)[..., None], _water(x, y, horizon), picture)
+    picture = np.where((y > horizon)[..., None], _draw_water(x, y, horizon), picture)
     picture = picture.reshape(size, 2, size, 2, 3).mean((1, 3))
     return torch.from_numpy(np.rint(picture * 255).clip(0, 255).astype(np.uint8))
 
 
-def _sky(x: Plane, y: Plane, horizon: float) -> Colours:
+def _draw_sky(x: Plane, y: Plane, horizon: float) -> Colours:
     stops = np.array([0.0, 0.35, 0.7, 1.0])
     colours = np.array([[0.09, 0.13, 0.36], [0.45, 0.27, 0.56], [0.95, 0.48, 0.40], [1.0, 0.80, 0.45]])
     t = (y / horizon).clip(0, 1)
     sky = np.stack([np.interp(t, stops, colours[:, c]) for c in range(3)], axis=-1)
-    distance = np.hypot(x - SUN[0], y - SUN[1])
+    distance = np.hypot(x - SUN_POSITION[0], y - SUN_POSITION[1])
     glow = np.exp(-((distance / 0.20) ** 2))[..., None]
     sky = sky + glow * (np.array([1.0, 0.85, 0.5]) - sky) * 0.8
     sky = np.where((distance < 0.095)[..., None], np.array([1.0, 0.96, 0.78]), sky)
-    return _balloon(sky, x, y)
+    return _draw_balloon(sky, x, y)
 
 
-def _balloon(sky: Colours, x: Plane, y: Plane) -> Colours:
+def _draw_balloon(sky: Colours, x: Plane, y: Plane) -> Colours:
     u, v = (x - 0.25) / 0.12, (y - 0.185) / 0.12
     taper = np.where(v > 0, np.sqrt((1 - (v / 1.35) ** 2).clip(0, 1)), np.sqrt((1 - v**2).clip(0, 1)))
     gore = np.floor(np.arcsin((u / taper.clip(1e-6)).clip(-1, 1)) * 7 / np.pi + 8.5).astype(int) % 4
@@ -75,7 +75,7 @@ def _balloon(sky: Colours, x: Plane, y: Plane) -> Colours:
     return np.where((basket | ropes)[..., None], np.array([0.30, 0.16, 0.10]), sky)
 
 
-def _water(x: Plane, y: Plane, horizon: float) -> Colours:
+def _draw_water(x: Plane, y: Plane, horizon: float) -> Colours:
     near = ((y - horizon) / (1 - horizon)).clip(1e-3, 1)
     # Perspective: equal waves crowd together as 1/near, up to the pixel grid's limit and past it at the horizon.
     depth = 1 / (near + 0.07)
@@ -85,5 +85,5 @@ def _water(x: Plane, y: Plane, horizon: float) -> Colours:
     deep, bright = np.array([0.07, 0.16, 0.34]), np.array([0.96, 0.60, 0.42])
     mix = ((0.62 - 0.5 * near) + 0.30 * wave)[..., None].clip(0, 1)
     water = deep + mix * (bright - deep)
-    path = np.exp(-(((x - SUN[0]) / (0.05 + 0.10 * near)) ** 2)) * (wave > -0.1)
+    path = np.exp(-(((x - SUN_POSITION[0]) / (0.05 + 0.10 * near)) ** 2)) * (wave > -0.1)
     return water + path[..., None] * (np.array([1.0, 0.93, 0.70]) - water) * 0.85

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, typical_view
+from nerf_lightning.cameras import Bounds, Cameras, find_typical_view
 from nerf_lightning.dataset.views import Views
 
 BUILT_IN = "built-in"
@@ -43,7 +43,7 @@ class Scene:
     @property
     def resolution(self) -> tuple[int, int]:
         """Width and height in pixels of the commonest training photo."""
-        return self.train.cameras.size(typical_view(self.train.cameras))
+        return self.train.cameras.size(find_typical_view(self.train.cameras))
 
     def sha256(self) -> str:
         """A fingerprint of the pictures and their split, the same for every file format that holds them."""
@@ -51,8 +51,8 @@ class Scene:
         for views in (self.train, self.val):
             digest.update(repr((views.cameras.sizes.tolist(), views.channels)).encode())
             digest.update(views.pixels.numpy().data)
-            if views.known is not None:
-                digest.update(views.known.numpy().data)
+            if views.valid_mask is not None:
+                digest.update(views.valid_mask.numpy().data)
         return digest.hexdigest()
 
     def describe(self) -> dict[str, object]:

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.utils.tensors import TensorDataclass
+from nerf_lightning.utils.tensor_dataclass import TensorDataclass
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Views(TensorDataclass):
     pixels: UInt8[Tensor, "N C"]
     """sRGB, photo after photo, each row by row; C is 3, or 4 with straight (not premultiplied) alpha."""
     cameras: Cameras
-    known: Bool[Tensor, "N"] | None = None
+    valid_mask: Bool[Tensor, "N"] | None = None
     """Pixels that count; None for all of them."""
     names: tuple[str, ...] = ()
     """Of the photos' files; empty where they have none."""
@@ -26,7 +26,7 @@ class Views(TensorDataclass):
     """Light that each photo gathered, in any unit; empty unless all files state it."""
 
     @classmethod
-    def of(cls, images: UInt8[Tensor, "V H W C"], cameras: Cameras) -> "Views":
+    def from_images(cls, images: UInt8[Tensor, "V H W C"], cameras: Cameras) -> "Views":
         """Photos of one size; no copy where they lie in memory one after the other."""
         return cls(images.reshape(-1, images.shape[3]), cameras)
 
@@ -41,10 +41,10 @@ class Views(TensorDataclass):
     @property
     def nbytes(self) -> int:
         """Of the pictures and their masks."""
-        return self.pixels.nbytes + (0 if self.known is None else self.known.nbytes)
+        return self.pixels.nbytes + (0 if self.valid_mask is None else self.valid_mask.nbytes)
 
     @cached_property
-    def starts(self) -> Int[Tensor, "V1"]:
+    def offsets(self) -> Int[Tensor, "V1"]:
         """Where each photo begins in `pixels`, and where the last ends."""
         return torch.cat([torch.zeros(1, dtype=torch.long), self.cameras.sizes.prod(1).cumsum(0)]).to(
             self.pixels.device
@@ -56,13 +56,13 @@ class Views(TensorDataclass):
         return self.cameras.sizes[:, 0].to(self.pixels.device)
 
     @cached_property
-    def _cuts(self) -> list[int]:
-        return self.starts.tolist()
+    def _view_offsets(self) -> list[int]:
+        return self.offsets.tolist()
 
     def image(self, view: int) -> UInt8[Tensor, "H W C"]:
         """One photo; no copy."""
         width, height = self.cameras.size(view)
-        start = self._cuts[view]
+        start = self._view_offsets[view]
         return self.pixels[start : start + width * height].view(height, width, -1)
 
     def name(self, view: int) -> str:
@@ -81,28 +81,28 @@ class Views(TensorDataclass):
     @cached_property
     def mask(self) -> Bool[Tensor, "N"]:
         """Which pixels count."""
-        if self.known is not None:
-            return self.known
+        if self.valid_mask is not None:
+            return self.valid_mask
         return torch.ones(len(self.pixels), dtype=torch.bool, device=self.pixels.device)
 
-    def draw(self, count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
+    def sample_pixels(self, count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
         """Places in `pixels`, drawn uniformly from those that count, with replacement."""
         device = self.pixels.device
-        places = torch.randint(len(self.pixels), (count,), generator=generator, device=device)
-        while self.known is not None and len(masked := (~self.known[places]).nonzero()[:, 0]):
-            places[masked] = torch.randint(len(self.pixels), (len(masked),), generator=generator, device=device)
-        return places
+        pixels = torch.randint(len(self.pixels), (count,), generator=generator, device=device)
+        while self.valid_mask is not None and len(masked := (~self.valid_mask[pixels]).nonzero()[:, 0]):
+            pixels[masked] = torch.randint(len(self.pixels), (len(masked),), generator=generator, device=device)
+        return pixels
 
-    def mask_of(self, view: int) -> Bool[Tensor, "H W"]:
+    def view_mask(self, view: int) -> Bool[Tensor, "H W"]:
         """Which pixels of a photo count."""
         width, height = self.cameras.size(view)
-        start = self._cuts[view]
+        start = self._view_offsets[view]
         return self.mask[start : start + width * height].view(height, width)
 
     def __getitem__(self, index: Tensor) -> "Views":
         """Some of the views; no copy of pixels where they follow each other."""
         chosen = index.tolist()
-        parts = [slice(self._cuts[view], self._cuts[view + 1]) for view in chosen]
+        parts = [slice(self._view_offsets[view], self._view_offsets[view + 1]) for view in chosen]
         if chosen and chosen == list(range(chosen[0], chosen[0] + len(chosen))):
             parts = [slice(parts[0].start, parts[-1].stop)]
 
@@ -110,11 +110,11 @@ class Views(TensorDataclass):
             return values[parts[0]] if len(parts) == 1 else torch.cat([values[:0], *(values[part] for part in parts)])
 
         pixels = take(self.pixels)
-        known = None if self.known is None else take(self.known)
+        known = None if self.valid_mask is None else take(self.valid_mask)
         names = tuple(self.names[view] for view in chosen) if self.names else ()
         exposures = tuple(self.exposures[view] for view in chosen) if self.exposures else ()
         return Views(pixels, self.cameras[index], known, names, exposures)
 
-    def spread(self, count: int) -> "Views":
+    def subsample(self, count: int) -> "Views":
         """At most `count` views, evenly spaced from the first to the last."""
         return self[torch.linspace(0, len(self) - 1, min(len(self), count)).round().long()]

@@ -8,27 +8,27 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.drawing.ink import BLUE, DPI, GREY, ORANGE, VERMILLION
+from nerf_lightning.drawing.style import BLUE, DPI, GREY, ORANGE, VERMILLION
 
-FRUSTUM = 0.06
+FRUSTUM_FRACTION = 0.06
 """Height of a camera's pyramid as a share of the map's width."""
-STROKE = [0, 1, 2, 0, 3, 2, 3, 4, 0, 4, 1]
+FRUSTUM_STROKE = [0, 1, 2, 0, 3, 2, 3, 4, 0, 4, 1]
 """Corners of a pyramid in an order that draws all of its edges."""
-CENTRED: dict[str, Any] = {"ha": "center", "va": "center", "annotation_clip": True}
-NUMBERS = 120
+CENTRED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "annotation_clip": True}
+MAX_NUMBERED = 120
 """Most cameras that are numbered; of more, every N-th is."""
 MAX_POINTS = 5000
-WIDE, HIGH = 13.0, 17.0
+MAX_WIDTH_INCHES, MAX_HEIGHT_INCHES = 13.0, 17.0
 """Largest size of the map, inches."""
 
 
-def frustum(K: Float[np.ndarray, "3 3"], width: int, height: int, depth: float) -> Float[np.ndarray, "5 3"]:
+def frustum_corners(K: Float[np.ndarray, "3 3"], width: int, height: int, depth: float) -> Float[np.ndarray, "5 3"]:
     """A camera's centre and the picture's corners at a depth, in the camera's frame."""
     corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]], dtype=np.float64)
     return depth * np.concatenate([np.zeros((1, 3)), np.linalg.solve(K, corners.T).T])
 
 
-def camera_map(
+def plot_camera_map(
     numbered: Sequence[tuple[int, Float[np.ndarray, "4 4"]]],
     scene: Scene,
     tags: dict[int, Float[np.ndarray, "M 3"]],
@@ -42,26 +42,26 @@ def camera_map(
         tags: corners in the world by id.
         unit: of lengths, in words.
     """
-    camera = scene.train.cameras[0].as_pinholes()
+    camera = scene.train.cameras[0].to_pinhole()
     orbit, box = scene.orbit.centres.double().numpy(), scene.bounds.aabb.double().numpy()
     solid = np.concatenate([np.stack([c2w[:3, 3] for _, c2w in numbered]), orbit, box, *tags.values()])
-    depth = FRUSTUM * float(np.ptp(solid[:, :2], axis=0).max())
-    shape = frustum(camera.K[0].double().numpy(), *camera.size(0), depth)
+    depth = FRUSTUM_FRACTION * float(np.ptp(solid[:, :2], axis=0).max())
+    shape = frustum_corners(camera.K[0].double().numpy(), *camera.size(0), depth)
     frusta = np.stack([shape @ c2w[:3, :3].T + c2w[:3, 3] for _, c2w in numbered])
     everything = np.concatenate([solid, frusta.reshape(-1, 3)])
     low, high = everything.min(0) - depth / 2, everything.max(0) + depth / 2
 
     span = high - low
-    scale = min(WIDE / span[0], HIGH / (span[1] + span[2]))
+    scale = min(MAX_WIDTH_INCHES / span[0], MAX_HEIGHT_INCHES / (span[1] + span[2]))
     size = max(scale * span[0] + 1.5, 8.0), scale * (span[1] + span[2]) + 2.5
     figure = Figure(figsize=size, dpi=DPI, layout="constrained")
-    above, beside = figure.subplots(2, 1, height_ratios=(span[1], span[2]), sharex=True)
-    for axes, up, name in ((above, 1, "from above"), (beside, 2, "from the side")):
+    above, side = figure.subplots(2, 1, height_ratios=(span[1], span[2]), sharex=True)
+    for axes, up, name in ((above, 1, "from above"), (side, 2, "from the side")):
         axes.set(xlim=(low[0], high[0]), ylim=(low[up], high[up]), aspect="equal", ylabel=f"{'xyz'[up]}, {unit}")
         axes.set_title(name, loc="left")
         axes.grid(color="0.92")
         axes.set_axisbelow(True)
-        broken = np.pad(frusta[:, STROKE][..., [0, up]], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+        broken = np.pad(frusta[:, FRUSTUM_STROKE][..., [0, up]], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
         axes.plot(*broken.reshape(-1, 2).T, color=BLUE, linewidth=0.8, label="cameras, numbered as the photos are")
         for tag, corners in tags.items():
             label = "" if tag != next(iter(tags)) else "tags, with their ids"
@@ -73,11 +73,11 @@ def camera_map(
         if scene.points is not None:
             some = scene.points[:: -(-len(scene.points) // MAX_POINTS)].numpy()
             axes.plot(some[:, 0], some[:, up], ".", color="0.6", markersize=1.5, zorder=0.5, label="known points")
-        for (number, _), points in list(zip(numbered, frusta, strict=True))[:: -(-len(frusta) // NUMBERS)]:
-            behind = points[0] - 0.35 * (points[1:].mean(0) - points[0])  # where there are no lines
-            axes.annotate(str(number), behind[[0, up]], fontsize=8, **CENTRED)
-    beside.set_xlabel(f"x, {unit}")
+        for (number, _), points in list(zip(numbered, frusta, strict=True))[:: -(-len(frusta) // MAX_NUMBERED)]:
+            label_position = points[0] - 0.35 * (points[1:].mean(0) - points[0])  # where there are no lines
+            axes.annotate(str(number), label_position[[0, up]], fontsize=8, **CENTRED_TEXT)
+    side.set_xlabel(f"x, {unit}")
     for tag, corners in tags.items():
-        above.annotate(str(tag), corners[:, :2].mean(0), fontsize=9, color=VERMILLION, **CENTRED)
+        above.annotate(str(tag), corners[:, :2].mean(0), fontsize=9, color=VERMILLION, **CENTRED_TEXT)
     figure.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
     return figure

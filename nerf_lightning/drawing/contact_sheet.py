@@ -10,15 +10,15 @@ from matplotlib.font_manager import findfont
 from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
-from nerf_lightning.drawing.ink import FONT, VERMILLION, readable
+from nerf_lightning.drawing.style import FONT, VERMILLION, replace_missing_glyphs
 
-GAP = 12
+GAP_PX = 12
 """Pixels between images."""
-LETTER_WIDTH = 0.6
+LETTER_WIDTH_RATIO = 0.6
 """Of `FONT`, as a share of its size, on average."""
 
 
-def contact_sheet(
+def make_contact_sheet(
     images: Sequence[UInt8[ndarray, "_ _ 3"] | None],
     captions: Sequence[str],
     columns: int,
@@ -42,26 +42,26 @@ def contact_sheet(
     shapes = [image.shape[:2] for image in images if image is not None] or [(3, 4)]
     if width is None:
         cell = max(w for _, w in shapes)
-        box, width = max(h for h, _ in shapes), columns * (cell + GAP) + GAP
+        box, width = max(h for h, _ in shapes), columns * (cell + GAP_PX) + GAP_PX
     else:
-        cell = (width - GAP) // columns - GAP
+        cell = (width - GAP_PX) // columns - GAP_PX
         box = round(cell * float(np.median([h / w for h, w in shapes])))
-    scaled = [np.full((box, cell, 3), 221, np.uint8) if one is None else fit_into(one, cell, box) for one in images]
-    texts = [wrap(caption, cell, text_px) for caption in captions]
-    title = wrap(heading, width - 2 * GAP, 3 * text_px // 2)
+    scaled = [np.full((box, cell, 3), 221, np.uint8) if one is None else fit_image(one, cell, box) for one in images]
+    texts = [wrap_text(caption, cell, text_px) for caption in captions]
+    title = wrap_text(heading, width - 2 * GAP_PX, 3 * text_px // 2)
     line = round(1.3 * text_px)
-    tops = [GAP + 3 * line // 2 * len(title)]
+    tops = [GAP_PX + 3 * line // 2 * len(title)]
     for first in range(0, len(images), columns):
         row = range(first, min(first + columns, len(images)))
-        tops.append(tops[-1] + max(scaled[i].shape[0] + line * len(texts[i]) for i in row) + 2 * GAP)
+        tops.append(tops[-1] + max(scaled[i].shape[0] + line * len(texts[i]) for i in row) + 2 * GAP_PX)
 
     sheet = Image.new("RGB", (width, tops[-1]), "white")
     draw = ImageDraw.Draw(sheet)
     small, large = (ImageFont.truetype(findfont(FONT), size) for size in (text_px, 3 * text_px // 2))
     for n, words in enumerate(title):
-        draw.text((GAP, GAP // 2 + n * (3 * line // 2)), words, "black", large)
+        draw.text((GAP_PX, GAP_PX // 2 + n * (3 * line // 2)), words, "black", large)
     for i, (image, text) in enumerate(zip(scaled, texts, strict=True)):
-        left, top = GAP + i % columns * (cell + GAP), tops[i // columns]
+        left, top = GAP_PX + i % columns * (cell + GAP_PX), tops[i // columns]
         right, bottom = left + image.shape[1], top + image.shape[0]
         sheet.paste(Image.fromarray(image), (left, top))
         if i in flagged:
@@ -71,7 +71,7 @@ def contact_sheet(
     return np.array(sheet)
 
 
-def fit_into(image: UInt8[ndarray, "H W 3"], width: int, height: int) -> UInt8[ndarray, "h w 3"]:
+def fit_image(image: UInt8[ndarray, "H W 3"], width: int, height: int) -> UInt8[ndarray, "h w 3"]:
     """Scales an image to the largest size in a box: averaged where that is smaller, with hard edges where it is larger."""
     rows, cols = image.shape[:2]
     scale = min(width / cols, height / rows)
@@ -81,7 +81,7 @@ def fit_into(image: UInt8[ndarray, "H W 3"], width: int, height: int) -> UInt8[n
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST))
 
 
-def wrap(text: str, width: int, text_px: int) -> list[str]:
+def wrap_text(text: str, width: int, text_px: int) -> list[str]:
     """Lines of at most about `width` pixels; line ends in the text stay."""
-    letters = max(1, int(width / (LETTER_WIDTH * text_px)))
-    return [line for part in text.splitlines() for line in textwrap.wrap(readable(part), letters)]
+    letters = max(1, int(width / (LETTER_WIDTH_RATIO * text_px)))
+    return [line for part in text.splitlines() for line in textwrap.wrap(replace_missing_glyphs(part), letters)]

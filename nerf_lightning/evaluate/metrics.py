@@ -13,11 +13,11 @@ from torchmetrics.functional.image import learned_perceptual_image_patch_similar
 
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
 from nerf_lightning.system import System, ViewResult
-from nerf_lightning.utils.files import known
+from nerf_lightning.utils.files import nan_to_none
 from nerf_lightning.utils.machine import describe_machine
-from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.progress import track_progress
 
-DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 3}
+TABLE_DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 3}
 """Decimals of a view's figures. SSIM is nan for views smaller than its window, LPIPS where it cannot be computed."""
 ALEXNET_WEIGHTS = "alexnet-owt-7be5be79.pth"
 """As torchvision names them in torch.hub's folder."""
@@ -31,13 +31,13 @@ def measure_views(
     """The figures of all held-out views, and the results of the worst ones by their number."""
     lpips, rows = load_lpips(), []
     results: dict[int, ViewResult] = {}
-    views = tracked(range(data.held_out_views), data.held_out_views, "held-out views")
+    views = track_progress(range(data.num_held_out_views), data.num_held_out_views, "held-out views")
     for view, result in enumerate(system.evaluate_held_out(data, views)):
-        rows.append((result.psnr, result.ssim, lpips(result.rgb, result.comparable), result.seconds))
+        rows.append((result.psnr, result.ssim, lpips(result.rgb, result.masked_truth), result.seconds))
         results[view] = result
         if len(results) > worst:
             del results[max(results, key=lambda one: results[one].psnr)]
-    return pd.DataFrame(rows, columns=list(DIGITS), dtype=float), results
+    return pd.DataFrame(rows, columns=list(TABLE_DECIMALS), dtype=float), results
 
 
 def load_lpips() -> Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], float]:
@@ -66,7 +66,7 @@ def load_lpips() -> Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], f
 def format_table(views: pd.DataFrame) -> str:
     """All views, the worst marked, and their means."""
     rows = pd.concat([views, views.mean(skipna=False).to_frame("mean").T])
-    table = pd.DataFrame({name: rows[name].map(f"{{:.{digits}f}}".format) for name, digits in DIGITS.items()})
+    table = pd.DataFrame({name: rows[name].map(f"{{:.{digits}f}}".format) for name, digits in TABLE_DECIMALS.items()})
     worst = views["psnr"] == views["psnr"].min()
     table[""] = ["<- worst" if mark and len(views) > 1 else "" for mark in (*worst, False)]
     names = {"psnr": "PSNR, dB", "ssim": "SSIM", "lpips": "LPIPS"}
@@ -77,5 +77,5 @@ def to_json(views: pd.DataFrame, source: Path, scene: dict[str, object], device:
     """The evaluation as plain values; the mean of a figure that some view lacks is None."""
     machine = {"device": str(device), "machine": describe_machine(device)}
     records = views.reset_index(names="view").to_dict("records")
-    figures = {"mean": known(views.mean(skipna=False).to_dict()), "views": known(records)}
+    figures = {"mean": nan_to_none(views.mean(skipna=False).to_dict()), "views": nan_to_none(records)}
     return {"run": str(source), "scene": scene, **machine, **figures}

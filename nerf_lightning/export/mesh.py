@@ -11,14 +11,14 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras, spiral_like
-from nerf_lightning.drawing.panels import to_bytes
+from nerf_lightning.cameras import Cameras, make_spiral_path
+from nerf_lightning.drawing.panels import to_uint8
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.smallest import MOST_VIEWS, some_cameras
-from nerf_lightning.export.surface import Surface, find_surface, lit_cells
-from nerf_lightning.export.volume import PLACES, Volume
-from nerf_lightning.runs.data import data_again
-from nerf_lightning.runs.open import SceneRun
+from nerf_lightning.export.compress import MAX_VISIBILITY_VIEWS, subsample_cameras
+from nerf_lightning.export.surface import Surface, extract_surface, find_unoccluded_cells
+from nerf_lightning.export.volume import POSITIONS_PER_SAMPLE, Volume
+from nerf_lightning.runs.open import LoadedSceneRun
+from nerf_lightning.runs.reload import reload_data
 from nerf_lightning.system import NeRF3D
 
 if TYPE_CHECKING:
@@ -28,83 +28,87 @@ SUFFIXES = {"mesh": (".ply", ".glb", ".obj", ".stl"), "points": (".ply",), "voxe
 """Of files, by what they hold; the default first."""
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 """From z up, as scenes have it, to y up, as glTF wants it: written as the node's transform."""
-SINGLE = 2.0**-24
+FLOAT32_ROUNDOFF = 2.0**-24
 """Largest relative error of a number rounded to single precision."""
-MAX_ERROR = 1e-4
+MAX_RELATIVE_ERROR = 1e-4
 """Largest rounding error of a vertex, as a share of a mesh's longest side: a fortieth of the finest cell's."""
-DIGITS, COLOUR_DIGITS = 9, 4
+OBJ_DIGITS, OBJ_COLOUR_DECIMALS = 9, 4
 """Significant digits of an OBJ file's coordinates, relative to the mesh's longest side, and decimals of colours."""
 
 
-class Shape(NamedTuple):
+class ExportedFile(NamedTuple):
     """A file's content, and what it holds in words."""
 
     content: bytes
-    words: str
+    description: str
 
 
-def training_views(run: SceneRun, photos: Path | None = None) -> Cameras:
+def select_training_views(run: LoadedSceneRun, photos: Path | None = None) -> Cameras:
     """Some of the views that a field was trained from; without photos, a spiral that begins on its orbit."""
     try:
-        data = data_again(run.cfg, run.scene, photos)
+        data = reload_data(run.cfg, run.scene, photos)
     except InputError as error:
         if photos is not None:
             raise
         print(f"without the photos' cameras, from a spiral: {error}")
-        return spiral_like(run.orbit, MOST_VIEWS)
-    return some_cameras(data)
+        return make_spiral_path(run.orbit, MAX_VISIBILITY_VIEWS)
+    return subsample_cameras(data)
 
 
 @torch.no_grad()
-def colours_at(system: NeRF3D, places: Float[Tensor, "N 3"], outwards: Float[Tensor, "N 3"]) -> UInt8[ndarray, "N 3"]:
+def query_colours(
+    system: NeRF3D, positions: Float[Tensor, "N 3"], outwards: Float[Tensor, "N 3"]
+) -> UInt8[ndarray, "N 3"]:
     """The colours of a field at some places, seen against their outward directions, world frame."""
-    together = PLACES * system.chunk
+    together = POSITIONS_PER_SAMPLE * system.chunk
     parts = [
         system.field(some.to(system.device), -away.to(system.device))[1].cpu()
-        for some, away in zip(places.split(together), outwards.split(together), strict=True)
+        for some, away in zip(positions.split(together), outwards.split(together), strict=True)
     ]
-    return to_bytes(torch.cat([torch.zeros(0, 3), *parts]))
+    return to_uint8(torch.cat([torch.zeros(0, 3), *parts]))
 
 
-def coloured_mesh(
-    run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None
+def extract_mesh(
+    run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None
 ) -> tuple["trimesh.Trimesh", Surface]:
     """The surface of a field's solid, as some cameras see it, with a colour at each vertex, in the photos' frame."""
     import trimesh
 
-    surface = find_surface(volume, lit_cells(run.system, volume, cameras), threshold)
+    surface = extract_surface(volume, find_unoccluded_cells(run.system, volume, cameras), threshold)
     normals = torch.from_numpy(surface.normals)
-    places = torch.from_numpy(surface.vertices)
+    positions = torch.from_numpy(surface.vertices)
     # Half a cell inside: just outside the surface no photo constrains the colour.
-    rgb = colours_at(run.system, places - normals * (volume.cell / 2), normals)
+    rgb = query_colours(run.system, positions - normals * (volume.cell / 2), normals)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=rgb, process=False)
     mesh.apply_transform(run.to_source.numpy())
     return mesh, surface
 
 
-def mesh_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str) -> Shape:
+def build_mesh_file(
+    run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str
+) -> ExportedFile:
     """A coloured mesh as .ply, .obj or .glb; its triangles alone as .stl."""
-    mesh, surface = coloured_mesh(run, cameras, volume, threshold)
+    mesh, surface = extract_mesh(run, cameras, volume, threshold)
     content = encode_mesh(mesh, suffix, run.to_source[:3, :3].T.numpy() / run.scale)
-    words = [
+    description = [
         f"{len(mesh.faces):,} triangles",
         "watertight" if mesh.is_watertight else "with open edges",
         " x ".join(f"{side:.4g}" for side in mesh.extents) + " in the photos' unit",
         f"surface at opacity {surface.threshold:.2f}",
         *([f"{surface.floaters} floating pieces left out"] if surface.floaters else []),
     ]
-    return Shape(content, ", ".join(words))
+    return ExportedFile(content, ", ".join(description))
 
 
-def points_file(run: SceneRun, cameras: Cameras, volume: Volume, threshold: float | None) -> Shape:
+def build_points_file(run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None) -> ExportedFile:
     """The mesh's vertices alone, with their colours, as .ply."""
-    mesh, surface = coloured_mesh(run, cameras, volume, threshold)
+    mesh, surface = extract_mesh(run, cameras, volume, threshold)
     colours: Any = mesh.visual
     content = encode_ply(mesh.vertices, colours.vertex_colors[:, :3])
-    return Shape(content, f"{len(mesh.vertices):,} points, surface at opacity {surface.threshold:.2f}")
+    return ExportedFile(content, f"{len(mesh.vertices):,} points, surface at opacity {surface.threshold:.2f}")
 
 
-def voxels_file(run: SceneRun, volume: Volume) -> Shape:
+def build_voxels_file(run: LoadedSceneRun, volume: Volume) -> ExportedFile:
     """Densities and colours of all cells as .npz.
 
     `density` [X, Y, Z] is per unit of the photos' file, `rgb` [X, Y, Z, 3] what is seen looking along the density's
@@ -118,7 +122,7 @@ def voxels_file(run: SceneRun, volume: Volume) -> Shape:
     outwards = -torch.nn.functional.normalize(gradient[solid], dim=-1)
     outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # where density is even, any direction will do
     rgb = np.zeros((*solid.shape, 3), np.uint8)
-    rgb[solid.numpy()] = colours_at(run.system, volume.places(index.float()), outwards)
+    rgb[solid.numpy()] = query_colours(run.system, volume.index_to_world(index.float()), outwards)
     file = io.BytesIO()
     arrays: dict[str, Any] = {
         "density": (volume.density / run.scale).numpy().astype(np.float32),
@@ -127,7 +131,7 @@ def voxels_file(run: SceneRun, volume: Volume) -> Shape:
     }
     np.savez_compressed(file, **arrays)
     shape = " x ".join(map(str, solid.shape))
-    return Shape(file.getvalue(), f"{shape} cells, {len(index):,} of them not empty")
+    return ExportedFile(file.getvalue(), f"{shape} cells, {len(index):,} of them not empty")
 
 
 def encode_ply(vertices: Float[ndarray, "V 3"], rgb: UInt8[ndarray, "V 3"], faces: ndarray | None = None) -> bytes:
@@ -168,12 +172,12 @@ def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "3 3"
     if suffix == ".ply":
         return encode_ply(mesh.vertices, colours.vertex_colors[:, :3], mesh.faces)
     if suffix == ".obj":
-        digits = max(COLOUR_DIGITS, DIGITS - math.floor(math.log10(float(mesh.extents.max()))))
+        digits = max(OBJ_COLOUR_DECIMALS, OBJ_DIGITS - math.floor(math.log10(float(mesh.extents.max()))))
         content = mesh.export(file_type="obj", digits=digits, header="nerf_lightning", include_normals=False)
         return content.encode()
     if suffix == ".stl":
         farthest = float(np.abs(mesh.vertices).max())
-        if farthest * SINGLE > MAX_ERROR * mesh.extents.max():
+        if farthest * FLOAT32_ROUNDOFF > MAX_RELATIVE_ERROR * mesh.extents.max():
             found = f".stl for coordinates up to {farthest:.6g}, too large for its single precision"
             raise InputError("export", "output", found, ".obj, .ply or .glb")
         content = mesh.export(file_type="stl")

@@ -3,45 +3,52 @@
 The fast versions for CPUs are in `cpu/`; `use_kernels("reference")` (config key `kernels`) switches them all off.
 """
 
-from nerf_lightning.kernels.composite import composite, keep_visible, volume_weights
-from nerf_lightning.kernels.front_first import front_first
+from nerf_lightning.kernels.backend import has_fast_kernel, set_kernels
+from nerf_lightning.kernels.composite import composite, filter_visible, volume_weights
 from nerf_lightning.kernels.harmonics import spherical_harmonics
 from nerf_lightning.kernels.hashgrid import hash_interpolate
-from nerf_lightning.kernels.march import cell_index, march, mark_cells, pack_intervals, points
-from nerf_lightning.kernels.merge import merge_faint
+from nerf_lightning.kernels.march import cell_index, march, mark_cells, pack_intervals, ray_positions
+from nerf_lightning.kernels.march_until_opaque import march_until_opaque
+from nerf_lightning.kernels.merge import merge_low_weight
 from nerf_lightning.kernels.mlp import mlp, mlp_heads
-from nerf_lightning.kernels.planes import plane_line_products, plane_line_sum, plane_line_sum_and_products
-from nerf_lightning.kernels.proposals import along, inverse_cdf, resample
-from nerf_lightning.kernels.switch import has_fast, use_kernels
-from nerf_lightning.kernels.voxels import interpolate_rows, locate, mark_rows, read_voxels, roughness, voxel_value
+from nerf_lightning.kernels.resampling import interval_midpoints, invert_cdf, resample
+from nerf_lightning.kernels.vector_matrix import plane_line_products, plane_line_sum, plane_line_sum_and_products
+from nerf_lightning.kernels.voxels import (
+    interpolate_rows,
+    interpolate_scalar,
+    interpolate_voxels,
+    locate_vertices,
+    mark_rows,
+    total_variation,
+)
 
 __all__ = [
-    "along",
+    "interval_midpoints",
     "cell_index",
     "composite",
-    "front_first",
-    "has_fast",
+    "march_until_opaque",
+    "has_fast_kernel",
     "hash_interpolate",
     "interpolate_rows",
-    "inverse_cdf",
-    "keep_visible",
-    "locate",
+    "invert_cdf",
+    "filter_visible",
+    "locate_vertices",
     "march",
     "mark_cells",
     "mark_rows",
-    "merge_faint",
+    "merge_low_weight",
     "mlp",
     "mlp_heads",
     "pack_intervals",
     "plane_line_products",
     "plane_line_sum",
     "plane_line_sum_and_products",
-    "points",
-    "read_voxels",
+    "ray_positions",
+    "interpolate_voxels",
     "resample",
-    "roughness",
+    "total_variation",
     "spherical_harmonics",
-    "use_kernels",
+    "set_kernels",
     "volume_weights",
-    "voxel_value",
+    "interpolate_scalar",
 ]

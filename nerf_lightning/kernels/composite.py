@@ -7,13 +7,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.march import Packed, offsets_from_counts, within
-from nerf_lightning.kernels.sums import before
-from nerf_lightning.kernels.switch import has_fast
+from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels.march import Packed, first_true_indices, offsets_from_counts
+from nerf_lightning.kernels.segment_sums import exclusive_sum
 
-Pixels = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
+CompositedRays = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
 """Colour, opacity and depth summed along each ray, each sample by its weight."""
-Kept = tuple[
+VisibleSamples = tuple[
     Float[Tensor, "K"], tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
 ]
 """Optical thickness of the K of N samples that are kept, and what `Packed` says of them."""
@@ -36,10 +36,12 @@ def volume_weights(
         Weights in [0, 1]; over a ray they add up to its opacity.
     """
     thinner = -density * dt
-    return -torch.exp(before(thinner, ray, offsets)) * torch.expm1(thinner)
+    return -torch.exp(exclusive_sum(thinner, ray, offsets)) * torch.expm1(thinner)
 
 
-def composite_reference(density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, ray: Tensor, offsets: Tensor) -> Pixels:
+def composite_reference(
+    density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, ray: Tensor, offsets: Tensor
+) -> CompositedRays:
     """`composite` in plain PyTorch, for every device."""
     weights = volume_weights(density, dt, ray, offsets)
     values = torch.cat([rgb, torch.ones_like(weights)[:, None], t[:, None]], dim=1)
@@ -50,11 +52,16 @@ def composite_reference(density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, ray
 
 class _Composite(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, offsets: Tensor) -> Pixels:
+    def forward(ctx, density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, offsets: Tensor) -> CompositedRays:
         rays, density, rgb = len(offsets) - 1, density.contiguous(), rgb.T.contiguous()
-        colour, opacity, depth, before = torch.empty(3, rays), torch.empty(rays), torch.empty(rays), torch.empty(len(t))
-        cpu.composite.forward(density, rgb, t, dt, offsets, colour, opacity, depth, before)
-        ctx.save_for_backward(density, rgb, t, dt, offsets, before)
+        colour, opacity, depth, transmittance = (
+            torch.empty(3, rays),
+            torch.empty(rays),
+            torch.empty(rays),
+            torch.empty(len(t)),
+        )
+        cpu.composite.forward(density, rgb, t, dt, offsets, colour, opacity, depth, transmittance)
+        ctx.save_for_backward(density, rgb, t, dt, offsets, transmittance)
         return colour.T, opacity, depth
 
     @staticmethod
@@ -71,7 +78,7 @@ def composite(
     dt: Float[Tensor, "N"],
     ray: Int[Tensor, "N"],
     offsets: Int[Tensor, "R_plus_1"],
-) -> Pixels:
+) -> CompositedRays:
     """Sums colour, one, and distance over each ray, weighted as in `volume_weights`.
 
     Args:
@@ -82,63 +89,65 @@ def composite(
     Returns:
         Colour without background, opacity in [0, 1], and the sum of distances (not divided by opacity).
     """
-    if has_fast(density, rgb, constants=(t, dt)):
+    if has_fast_kernel(density, rgb, constants=(t, dt)):
         return _Composite.apply(density, rgb, t, dt, offsets)
     return composite_reference(density, rgb, t, dt, ray, offsets)
 
 
-def keep_visible_reference(
-    thickness: Tensor,
+def filter_visible_reference(
+    optical_depth: Tensor,
     packed: Packed,
     early_stop_eps: float,
-    min_thickness: float | Tensor,
-    room: int | None = None,
-    dropped: float = math.inf,
-) -> Kept:
-    """`keep_visible` in plain PyTorch, for every device."""
+    min_optical_depth: float | Tensor,
+    capacity: int | None = None,
+    max_dropped: float = math.inf,
+) -> VisibleSamples:
+    """`filter_visible` in plain PyTorch, for every device."""
     t, dt, ray, offsets = packed
-    nothing = thickness < min_thickness  # NaN stays, so that somebody notices
-    if dropped < math.inf:
-        thin = torch.where(nothing, thickness, 0.0)
-        nothing &= before(thin, ray, offsets) + thin <= dropped
-    keep = ~((before(thickness, ray, offsets) > -math.log(early_stop_eps)) | nothing)
-    if room is not None:  # drops what an earlier call repeated to fill its room
+    nothing = optical_depth < min_optical_depth  # NaN stays, so that somebody notices
+    if max_dropped < math.inf:
+        thin = torch.where(nothing, optical_depth, 0.0)
+        nothing &= exclusive_sum(thin, ray, offsets) + thin <= max_dropped
+    keep = ~((exclusive_sum(optical_depth, ray, offsets) > -math.log(early_stop_eps)) | nothing)
+    if capacity is not None:  # drops what an earlier call repeated to fill its room
         keep = keep & (dt > 0)
     counts = offsets_from_counts(keep)
-    if room is None:
+    if capacity is None:
         index, kept = keep.nonzero()[:, 0], counts.index_select(0, offsets)
-        found, t, dt, ray = (x.index_select(0, index) for x in (thickness, t, dt, ray))
+        found, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
         return found, (t, dt, ray, kept)
-    index, there = within(room, counts)
+    index, there = first_true_indices(capacity, counts)
     kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # a ray may end beyond the room of the earlier call
-    found, t, dt, ray = (x.index_select(0, index) for x in (thickness, t, dt, ray))
+    found, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
     return found * there, (t, dt * there, ray, kept)
 
 
-def keep_visible(
-    thickness: Float[Tensor, "N"],
+def filter_visible(
+    optical_depth: Float[Tensor, "N"],
     packed: Packed,
     early_stop_eps: float,
-    min_thickness: float | Float[Tensor, ""],
-    room: int | None = None,
-    dropped: float = math.inf,
-) -> Kept:
+    min_optical_depth: float | Float[Tensor, ""],
+    capacity: int | None = None,
+    max_dropped: float = math.inf,
+) -> VisibleSamples:
     """Drops samples that light cannot reach, and those that hold nothing.
 
     Args:
-        thickness: optical thickness of each sample, density times length.
+        optical_depth: optical depth of each sample, density times length.
         packed: midpoints, lengths, rays and offsets of N samples.
         early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
-        min_thickness: alpha threshold, as an optical thickness: a sample below it holds nothing.
-        room: see `march`.
-        dropped: optical thickness that a ray's samples below `min_thickness` may have together; the later ones stay.
+        min_optical_depth: alpha threshold, as an optical depth: a sample below it holds nothing.
+        capacity: see `march`.
+        max_dropped: optical depth that a ray's samples below `min_optical_depth` may have together; the later ones stay.
     """
     t, dt, ray, offsets = packed
-    if room is not None or not has_fast(thickness, constants=(t, dt)):
-        return keep_visible_reference(thickness, packed, early_stop_eps, min_thickness, room, dropped)
+    if capacity is not None or not has_fast_kernel(optical_depth, constants=(t, dt)):
+        return filter_visible_reference(optical_depth, packed, early_stop_eps, min_optical_depth, capacity, max_dropped)
     keep, counts = torch.empty(len(t), dtype=torch.bool), torch.empty(len(offsets) - 1, dtype=torch.int64)
-    cpu.composite.visible(thickness, offsets, early_stop_eps, float(min_thickness), dropped, keep, counts)
+    cpu.composite.mark_visible(
+        optical_depth, offsets, early_stop_eps, float(min_optical_depth), max_dropped, keep, counts
+    )
     kept = offsets_from_counts(counts)
     out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
-    cpu.composite.gather(keep, offsets, kept, thickness, t, dt, out, rays)
+    cpu.composite.pack_visible(keep, offsets, kept, optical_depth, t, dt, out, rays)
     return out[0], (out[1], out[2], rays, kept)

@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.constants import constant
-from nerf_lightning.kernels.switch import has_fast
+from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels.cached_constants import cache_constants
 
 # Products of coordinates that the harmonics are made of: of two coordinates, then of three.
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
@@ -40,7 +40,7 @@ TERMS: tuple[dict[int, float], ...] = (
 CONSTANTS = {0: 0.28209479177387814, 6: -0.31539156525252005}
 
 
-@constant
+@cache_constants
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, list[Tensor]]:
     """Factors of all powers, constants, and which coordinates and pairs are multiplied."""
     factors = [[terms.get(power, 0.0) for terms in TERMS] for power in range(9 + len(TRIPLES))]
@@ -65,7 +65,7 @@ def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 1
 
 def spherical_harmonics(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
     """Real spherical harmonics of degrees 0 to 3 at unit directions (orthonormal; Sloan 2013, appendix A2)."""
-    if not has_fast(constants=(d,)):
+    if not has_fast_kernel(constants=(d,)):
         return spherical_harmonics_reference(d)
     out = torch.empty(16, len(d))
     cpu.harmonics.evaluate(d, out)

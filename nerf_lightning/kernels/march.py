@@ -9,10 +9,10 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.constants import constant
-from nerf_lightning.kernels.switch import has_fast
+from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels.cached_constants import cache_constants
 
-MOST = 1 << 20
+INTERVALS_PER_CHUNK = 1 << 20
 """Intervals that the reference tests at a time, unless told otherwise."""
 BLOCK = 4
 """Cells along a side of a block; the fast version crosses an empty block in one leap."""
@@ -31,38 +31,40 @@ def cell_index(
 
 def offsets_from_counts(counts: Shaped[Tensor, "M"]) -> Int[Tensor, "M_plus_1"]:
     """The sum of the counts before each one, and of all: of a mask, how many entries are true."""
-    return torch.cat([_nothing(counts.device), counts.cumsum(0)])
+    return torch.cat([_zero(counts.device), counts.cumsum(0)])
 
 
-@constant
-def _nothing(device: torch.device) -> Int[Tensor, "1"]:
+@cache_constants
+def _zero(device: torch.device) -> Int[Tensor, "1"]:
     return torch.zeros(1, dtype=torch.int64, device=device)
 
 
-@constant
-def _numbers(bits: int, device: torch.device) -> Int[Tensor, "numbers"]:
+@cache_constants
+def _counting_numbers(bits: int, device: torch.device) -> Int[Tensor, "numbers"]:
     """1, 2, 3, ... 2^bits."""
     return torch.arange(1, (1 << bits) + 1, device=device)
 
 
-def within(room: int, counts: Int[Tensor, "M_plus_1"]) -> tuple[Int[Tensor, "room"], Bool[Tensor, "room"]]:
-    """Indices of the first `room` true entries, and which are real: the host need not wait for a count.
+def first_true_indices(
+    capacity: int, counts: Int[Tensor, "M_plus_1"]
+) -> tuple[Int[Tensor, "capacity"], Bool[Tensor, "capacity"]]:
+    """Indices of the first `capacity` true entries, and which are real: the host need not wait for a count.
 
-    Where fewer than `room` are true, the last one is repeated. `counts`: `offsets_from_counts` of the entries.
+    Where fewer than `capacity` are true, the last one is repeated. `counts`: `offsets_from_counts` of the entries.
     """
-    order, total = _numbers(room.bit_length(), counts.device)[:room], counts[-1:]
+    order, total = _counting_numbers(capacity.bit_length(), counts.device)[:capacity], counts[-1:]
     return torch.searchsorted(counts[1:], torch.minimum(order, total)), order <= total
 
 
 def _pack(
-    t: Float[Tensor, "R S"], dt: Float[Tensor, "R S"], keep: Bool[Tensor, "R S"], room: int | None = None
+    t: Float[Tensor, "R S"], dt: Float[Tensor, "R S"], keep: Bool[Tensor, "R S"], capacity: int | None = None
 ) -> Packed:
     steps, flat = keep.shape[1], keep.flatten()
-    if room is None:
+    if capacity is None:
         chosen, offsets = flat.nonzero()[:, 0], offsets_from_counts(keep.sum(1))
         return t.flatten().index_select(0, chosen), dt.flatten().index_select(0, chosen), chosen // steps, offsets
     counts = offsets_from_counts(flat)
-    chosen, there = within(room, counts)
+    chosen, there = first_true_indices(capacity, counts)
     length = dt.flatten().index_select(0, chosen) * there
     return t.flatten().index_select(0, chosen), length, chosen // steps, counts[::steps]
 
@@ -75,25 +77,25 @@ def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]
 
 def march_reference(
     rays: Rays, bounds: Bounds, near: Tensor, far: Tensor, shift: Tensor, occupied: Tensor,
-    samples: int, step: float, room: int | None = None, most: int = MOST,
+    samples: int, step: float, capacity: int | None = None, chunk: int = INTERVALS_PER_CHUNK,
 ) -> Packed:  # fmt: skip
     """`march` in plain PyTorch, for every device."""
     resolution = round(len(occupied) ** (1 / 3))
     # One more than `samples`: the shift may cut the first one short, and the last must reach the far end.
     steps = torch.arange(-0.5, samples + 1, device=near.device) + shift[:, None]
     if bounds.unbounded:
-        edges = bounds.distances(rays, near, far, (steps / samples).clamp(0, 1))
+        edges = bounds.s_to_t(rays, near, far, (steps / samples).clamp(0, 1))
     else:
         edges = torch.minimum(near[:, None] + steps.clamp_min(0) * step, far[:, None])
     start, end = edges[:, :-1], edges[:, 1:]
     t, keep = (start + end) / 2, end > start
-    rows = max(1, most // (samples + 1))
+    rows = max(1, chunk // (samples + 1))
     for first in range(0, len(rays), rows):
         part = slice(first, first + rows)
         places = (t[part, :, None] * rays.directions[part, None]).add_(rays.origins[part, None])
         cells = cell_index(bounds.to_unit(places), resolution, torch.int32)  # half the time of int64
         keep[part].logical_and_(occupied.index_select(0, cells.flatten()).view(cells.shape))
-    return _pack(t, end - start, keep, room)
+    return _pack(t, end - start, keep, capacity)
 
 
 def march(
@@ -105,8 +107,8 @@ def march(
     occupied: Bool[Tensor, "cells"],
     samples: int,
     step: float,
-    room: int | None = None,
-    most: int = MOST,
+    capacity: int | None = None,
+    chunk: int = INTERVALS_PER_CHUNK,
 ) -> Packed:
     """Equal steps from near to far; keeps those whose midpoint lies in an occupied cell.
 
@@ -115,18 +117,20 @@ def march(
         near, far: distances along each ray; a ray with near >= far gets nothing.
         shift: moves each ray's steps along it, as a share of a step, in [0, 1).
         occupied: cells of a cubic grid over the bounds' unit cube, last axis fastest.
-        samples: steps of an unbounded ray, spaced as `Bounds.distances` says; at most this many (and one) inside bounds.
+        samples: steps of an unbounded ray, spaced as `Bounds.s_to_t` says; at most this many (and one) inside bounds.
         step: length of a step inside bounds.
-        room: how many entries to make whatever is found, so that the host need not wait for a count. If fewer are found, the
-            last interval is repeated with length 0; if more, rays whose `offsets` end beyond `room` lack some.
-        most: intervals that the reference tests at a time, which bounds its memory.
+        capacity: how many entries to make whatever is found, so that the host waits for no count. If fewer are found, the
+            last interval is repeated with length 0; if more, rays whose `offsets` end beyond `capacity` lack some.
+        chunk: intervals that the reference tests at a time, which bounds its memory.
     """
-    if room is not None or not has_fast(constants=(rays.origins, rays.directions, near, far, shift)):
-        return march_reference(rays, bounds, near, far, shift, occupied, samples, step, room, most)
-    return Walk(rays, bounds, near, far, shift, occupied, samples, step).on(torch.arange(len(rays)), samples + 1)
+    if capacity is not None or not has_fast_kernel(constants=(rays.origins, rays.directions, near, far, shift)):
+        return march_reference(rays, bounds, near, far, shift, occupied, samples, step, capacity, chunk)
+    return RayMarcher(rays, bounds, near, far, shift, occupied, samples, step).advance(
+        torch.arange(len(rays)), samples + 1
+    )
 
 
-class Walk:
+class RayMarcher:
     """The fast `march`, which may go some steps at a time. Arguments as there."""
 
     def __init__(
@@ -147,38 +151,41 @@ class Walk:
             # A block's four cells in a row as one number.
             rows = occupied.view(torch.int32).view(cells, BLOCK, cells, BLOCK, cells)
             held = functools.reduce(torch.bitwise_or, [row for part in rows.unbind(1) for row in part.unbind(2)])
-        blocks = cpu.march.FAR * (held == 0).to(torch.uint8).flatten()
+        blocks = cpu.march.MAX_BLOCK_DISTANCE * (held == 0).to(torch.uint8).flatten()
         if not bounds.unbounded:
-            cpu.march.clear(blocks.view(cells, cells, cells))
-        inside = bounds.inside(rays) if bounds.unbounded else torch.empty(0, 2)
-        self.ends, self.shape = (near, far, inside, shift), (bounds.half_size, bounds.unbounded)
+            cpu.march.compute_block_distances(blocks.view(cells, cells, cells))
+        inside = bounds.content_interval(rays) if bounds.unbounded else torch.empty(0, 2)
+        self.ray_limits, self.shape = (near, far, inside, shift), (bounds.half_size, bounds.unbounded)
         self.steps = samples, np.float32(step)
         grid = occupied, resolution, blocks, cells
-        self.given = rays.origins, rays.directions, *self.ends, *grid, bounds.centre, *self.shape, *self.steps
-        self.after = torch.zeros(len(rays), dtype=torch.int32)
+        self.arguments = rays.origins, rays.directions, *self.ray_limits, *grid, bounds.centre, *self.shape, *self.steps
+        self.next_interval = torch.zeros(len(rays), dtype=torch.int32)
         """The interval at which each ray goes on."""
 
-    def on(self, which: Int[Tensor, "A"], most: int) -> Packed:
+    def advance(self, ray_indices: Int[Tensor, "A"], max_intervals: int) -> Packed:
         """The next intervals of some rays, at most so many of each; `offsets` counts these rays alone."""
-        found, counts = torch.empty(len(which), most, dtype=torch.int32), torch.empty_like(which)
-        cpu.march.walk(which, *self.given, most, self.after, found, counts)
+        intervals, counts = (
+            torch.empty(len(ray_indices), max_intervals, dtype=torch.int32),
+            torch.empty_like(ray_indices),
+        )
+        cpu.march.march(ray_indices, *self.arguments, max_intervals, self.next_interval, intervals, counts)
         offsets = offsets_from_counts(counts)
         total = int(offsets[-1])
         t, dt, ray = torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)
-        cpu.march.pack(which, *self.ends, *self.shape, *self.steps, found, offsets, t, dt, ray)
+        cpu.march.pack_steps(ray_indices, *self.ray_limits, *self.shape, *self.steps, intervals, offsets, t, dt, ray)
         return t, dt, ray, offsets
 
 
-def points_reference(origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Float[Tensor, "N 3"]:
-    """`points` in plain PyTorch, for every device."""
+def ray_positions_reference(origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Float[Tensor, "N 3"]:
+    """`ray_positions` in plain PyTorch, for every device."""
     return origins.index_select(0, ray) + t[:, None] * directions.index_select(0, ray)
 
 
-class _Points(torch.autograd.Function):
+class _RayPositions(torch.autograd.Function):
     @staticmethod
     def forward(ctx, origins: Tensor, directions: Tensor, ray: Tensor, t: Tensor) -> Tensor:
         out = torch.empty(3, len(t))
-        cpu.march.points(origins, directions, ray, t, out)
+        cpu.march.ray_positions(origins, directions, ray, t, out)
         ctx.save_for_backward(ray, t)
         ctx.rays = len(origins)
         return out.T
@@ -190,19 +197,19 @@ class _Points(torch.autograd.Function):
         return origins, directions, None, None
 
 
-def points(
+def ray_positions(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
 ) -> Float[Tensor, "N 3"]:
     """Positions at distances `t` along rays; `ray` holds each position's ray."""
-    if not has_fast(origins, directions, constants=(t,)):
-        return points_reference(origins, directions, ray, t)
-    return _Points.apply(origins, directions, ray, t)
+    if not has_fast_kernel(origins, directions, constants=(t,)):
+        return ray_positions_reference(origins, directions, ray, t)
+    return _RayPositions.apply(origins, directions, ray, t)
 
 
 def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions: Float[Tensor, "N 3"]) -> None:
     """Writes `mark` into each cell of a cubic grid over the bounds that holds any of the positions (world units)."""
     resolution = round(len(marks) ** (1 / 3))
-    if has_fast(positions):
-        cpu.march.mark(positions.T, bounds.centre, bounds.half_size, bounds.unbounded, marks, resolution, mark)
+    if has_fast_kernel(positions):
+        cpu.march.mark_cells(positions.T, bounds.centre, bounds.half_size, bounds.unbounded, marks, resolution, mark)
     else:
         marks.index_fill_(0, cell_index(bounds.to_unit(positions), resolution), mark)

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.switch import has_fast
+from nerf_lightning.kernels.backend import has_fast_kernel
 
 Layers = Sequence[tuple[Float[Tensor, "_ _"], Float[Tensor, "_"]]]
 """Matrix [outputs, inputs] and bias [outputs] of each layer."""
@@ -40,7 +40,7 @@ def _blocks(shapes: list[tuple[int, int]], row: np.ndarray) -> list[tuple[np.nda
 
 class _MLP(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, x: Tensor, extra: Tensor, first: int, *flat: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx, x: Tensor, extra: Tensor, num_head: int, *flat: Tensor) -> tuple[Tensor, Tensor]:
         shapes = [(len(matrix), matrix.shape[1]) for matrix in flat[::2]]
         widths = np.array([_padded(n) for n in (shapes[0][1], *(outputs for outputs, _ in shapes))])
         row = np.zeros((widths[1:] * (widths[:-1] + 1)).sum(), np.float32)
@@ -51,27 +51,27 @@ class _MLP(torch.autograd.Function):
         cpu.mlp.forward(row, widths, x, extra, out)
         ctx.save_for_backward(x, extra)
         ctx.network = shapes, widths, row
-        return out[:first].T, out[first:].T
+        return out[:num_head].T, out[num_head:].T
 
     @staticmethod
     def backward(ctx, *grads: Tensor) -> tuple[Tensor | None, ...]:
         x, extra = ctx.saved_tensors
         shapes, widths, row = ctx.network
-        grad_x, sums = torch.empty_like(x), np.empty((cpu.compile.workers(), len(row)), np.float32)
+        grad_x, sums = torch.empty_like(x), np.empty((cpu.jit.sync_num_threads(), len(row)), np.float32)
         cpu.mlp.backward(row, widths, x, extra, torch.cat([grad.T for grad in grads]), grad_x, sums)
         return grad_x.T, None, None, *(torch.tensor(part) for block in _blocks(shapes, sums.sum(0)) for part in block)
 
 
 def mlp_heads(
-    x: Float[Tensor, "N I"], layers: Layers, first: int, extra: Float[Tensor, "N E"] | None = None
+    x: Float[Tensor, "N I"], layers: Layers, num_head: int, extra: Float[Tensor, "N E"] | None = None
 ) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:
     """Like `mlp`, with the first outputs returned apart from the others, which saves splitting them."""
     parameters = [parameter for layer in layers for parameter in layer]
-    if not has_fast(x, *parameters, *(() if extra is None else (extra,))):
+    if not has_fast_kernel(x, *parameters, *(() if extra is None else (extra,))):
         out = mlp_reference(x, layers, None if extra is None else extra.detach())
-        head, rest = out.split([first, out.shape[1] - first], dim=1)
+        head, rest = out.split([num_head, out.shape[1] - num_head], dim=1)
         return head, rest
-    return _MLP.apply(x, x.new_empty(len(x), 0) if extra is None else extra, first, *parameters)
+    return _MLP.apply(x, x.new_empty(len(x), 0) if extra is None else extra, num_head, *parameters)
 
 
 def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Float[Tensor, "N O"]:

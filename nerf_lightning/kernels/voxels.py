@@ -9,16 +9,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.constants import constant
-from nerf_lightning.kernels.switch import has_fast
+from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels.cached_constants import cache_constants
 
 
-def side_of(index: Int[Tensor, "cells"]) -> int:
+def grid_side(index: Int[Tensor, "cells"]) -> int:
     """Vertices along each side of a cubic grid."""
     return round(len(index) ** (1 / 3))
 
 
-@constant
+@cache_constants
 def _steps(side: int, device: torch.device) -> tuple[Int[Tensor, "3"], Int[Tensor, "8"]]:
     """What a step along each axis adds to a vertex's number, and what each corner of a cell adds."""
     ends = torch.arange(2, device=device)
@@ -26,11 +26,11 @@ def _steps(side: int, device: torch.device) -> tuple[Int[Tensor, "3"], Int[Tenso
     return torch.tensor([side * side, side, 1], device=device), corners.flatten()
 
 
-def locate_reference(
+def locate_vertices_reference(
     index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
 ) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
-    """`locate` in plain PyTorch, for every device and differentiable in the positions."""
-    side = side_of(index)
+    """`locate_vertices` in plain PyTorch, for every device and differentiable in the positions."""
+    side = grid_side(index)
     strides, corners = _steps(side, unit.device)
     scaled = unit.clamp(0, 1) * (side - 1)
     cell = scaled.long().clamp_(0, side - 2)  # NaN becomes the smallest integer
@@ -41,41 +41,43 @@ def locate_reference(
     return index.index_select(0, vertices.flatten()).view(-1, 8), weights.flatten(1)
 
 
-class _Locate(torch.autograd.Function):
+class _LocateVertices(torch.autograd.Function):
     @staticmethod
     def forward(ctx, index: Tensor, unit: Tensor) -> tuple[Tensor, Tensor]:
-        places, cells = unit.T.contiguous(), side_of(index) - 1
+        places, cells = unit.T.contiguous(), grid_side(index) - 1
         rows, weights = torch.empty(len(unit), 8, dtype=torch.int32), torch.empty(len(unit), 8)
-        cpu.voxels.locate(index, cells, places, rows, weights)
+        cpu.voxels.locate_vertices(index, cells, places, rows, weights)
         ctx.save_for_backward(places)
         ctx.cells = cells
         ctx.mark_non_differentiable(rows)
         return rows, weights
 
     @staticmethod
-    def backward(ctx, _: Tensor, above: Tensor) -> tuple[None, Tensor]:
+    def backward(ctx, _: Tensor, grad_output: Tensor) -> tuple[None, Tensor]:
         (places,) = ctx.saved_tensors
         grad = torch.empty_like(places)
-        cpu.voxels.slope(ctx.cells, places, above, grad)
+        cpu.voxels.position_gradient(ctx.cells, places, grad_output, grad)
         return None, grad.T
 
 
-def locate(index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
+def locate_vertices(
+    index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
+) -> tuple[Int[Tensor, "N 8"], Float[Tensor, "N 8"]]:
     """Rows and trilinear weights of the eight vertices around each position, the last axis fastest.
 
     Args:
         index: row of every vertex of a cubic grid over the unit cube, 32-bit, last axis fastest.
         unit: positions in [0, 1]^3; outside they are clamped.
     """
-    return _Locate.apply(index, unit) if has_fast(unit) else locate_reference(index, unit)
+    return _LocateVertices.apply(index, unit) if has_fast_kernel(unit) else locate_vertices_reference(index, unit)
 
 
-def mark_rows(seen: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: int) -> None:
-    """Writes `step` into `seen` at the rows that were read; both tensors are 32-bit."""
-    if not has_fast(seen):
-        seen.index_fill_(0, rows.flatten().long(), step)
+def mark_rows(last_read_step: Int[Tensor, "V"], rows: Int[Tensor, "N 8"], step: int) -> None:
+    """Writes `step` into `last_read_step` at the rows that were read; both tensors are 32-bit."""
+    if not has_fast_kernel(last_read_step):
+        last_read_step.index_fill_(0, rows.flatten().long(), step)
     else:
-        cpu.voxels.mark(seen, rows, step)
+        cpu.voxels.mark_rows(last_read_step, rows, step)
 
 
 def interpolate_rows(
@@ -87,59 +89,59 @@ def interpolate_rows(
     return (found * weights.view(*weights.shape, *[1] * (values.dim() - 1))).sum(1)
 
 
-def voxel_value(
+def interpolate_scalar(
     values: Float[Tensor, "V"], index: Int[Tensor, "cells"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N"]:
     """Interpolates one value per vertex at positions in [0, 1]^3; fast without gradients, as samplers call it."""
-    if not has_fast(values, unit, constants=(values, unit) if torch.is_grad_enabled() else ()):
-        return interpolate_rows(values, *locate_reference(index, unit))
+    if not has_fast_kernel(values, unit, constants=(values, unit) if torch.is_grad_enabled() else ()):
+        return interpolate_rows(values, *locate_vertices_reference(index, unit))
     out = torch.empty(len(unit))
-    cpu.voxels.interpolate(values, index, side_of(index) - 1, unit.T, out)
+    cpu.voxels.interpolate(values, index, grid_side(index) - 1, unit.T, out)
     return out
 
 
-class _Read(torch.autograd.Function):
+class _InterpolateVoxels(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx, density: Tensor, colour: Tensor, views: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
+        ctx, density: Tensor, colour: Tensor, sh_coefficients: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
     ) -> tuple[Tensor, Tensor]:
         raw, rgb, basis = torch.empty(len(rows)), torch.empty(3, len(rows)), basis.T.contiguous()
         cpu.voxels.read(density, colour, rows, weights, raw, rgb)
         if len(basis):
-            cpu.voxels.add_views(views, rows, weights, basis, rgb, (0,) * len(basis))
-        ctx.save_for_backward(density, colour, views, rows, weights, basis)
+            cpu.voxels.add_sh_colour(sh_coefficients, rows, weights, basis, rgb, (0,) * len(basis))
+        ctx.save_for_backward(density, colour, sh_coefficients, rows, weights, basis)
         return raw, rgb.T
 
     @staticmethod
     def backward(ctx, raw: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, Tensor, None, Tensor | None, None]:
         *tables, rows, weights, basis = ctx.saved_tensors
         rgb, moved, lanes = rgb.T.contiguous(), None, (0,) * len(basis)
-        density, colour, views = (torch.zeros(table.shape) for table in tables)
+        density, colour, sh_coefficients = (torch.zeros(table.shape) for table in tables)
         cpu.voxels.scatter(density, colour, rows, weights, raw, rgb)
         if lanes:
-            cpu.voxels.scatter_views(views, rows, weights, basis, rgb, lanes)
+            cpu.voxels.scatter_sh(sh_coefficients, rows, weights, basis, rgb, lanes)
         if ctx.needs_input_grad[4]:
             moved = torch.empty(weights.shape)
-            cpu.voxels.pull(*tables[:2], rows, raw, rgb, moved)
+            cpu.voxels.weight_gradient(*tables[:2], rows, raw, rgb, moved)
             if lanes:
-                cpu.voxels.pull_views(tables[2], rows, basis, rgb, moved, lanes)
-        return density, colour, views, None, moved, None
+                cpu.voxels.add_sh_weight_gradient(tables[2], rows, basis, rgb, moved, lanes)
+        return density, colour, sh_coefficients, None, moved, None
 
 
-def read_voxels_reference(
-    density: Tensor, colour: Tensor, views: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
+def interpolate_voxels_reference(
+    density: Tensor, colour: Tensor, sh_coefficients: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
-    """`read_voxels` in plain PyTorch, for every device and differentiable in weights and basis too."""
+    """`interpolate_voxels` in plain PyTorch, for every device and differentiable in weights and basis too."""
     # One table: a single gather.
-    found = interpolate_rows(torch.cat([density[:, None], colour, views], dim=1), rows, weights)
-    raw, rgb, mixed = found.split([1, 3, views.shape[1]], dim=1)
+    found = interpolate_rows(torch.cat([density[:, None], colour, sh_coefficients], dim=1), rows, weights)
+    raw, rgb, mixed = found.split([1, 3, sh_coefficients.shape[1]], dim=1)
     return raw[:, 0], rgb + (mixed.unflatten(1, (3, -1)) * basis[:, None]).sum(2)
 
 
-def read_voxels(
+def interpolate_voxels(
     density: Float[Tensor, "V"],
     colour: Float[Tensor, "V 3"],
-    views: Float[Tensor, "V C"],
+    sh_coefficients: Float[Tensor, "V C"],
     rows: Int[Tensor, "N 8"],
     weights: Float[Tensor, "N 8"],
     basis: Float[Tensor, "N B"],
@@ -148,31 +150,31 @@ def read_voxels(
 
     Args:
         density, colour: of the vertices that are kept.
-        views: C = 3 B coefficients of the colour's view-dependent part, red's first.
-        rows, weights: of the vertices around each sample, as `locate` gives them.
+        sh_coefficients: C = 3 B coefficients of the colour's view-dependent part, red's first.
+        rows, weights: of the vertices around each sample, as `locate_vertices` gives them.
         basis: the basis functions at each sample's direction, constants.
     """
-    if has_fast(density, colour, views, weights, constants=(basis,)):
-        return _Read.apply(density, colour, views, rows, weights, basis)
-    return read_voxels_reference(density, colour, views, rows, weights, basis)
+    if has_fast_kernel(density, colour, sh_coefficients, weights, constants=(basis,)):
+        return _InterpolateVoxels.apply(density, colour, sh_coefficients, rows, weights, basis)
+    return interpolate_voxels_reference(density, colour, sh_coefficients, rows, weights, basis)
 
 
-class _Roughness(torch.autograd.Function):
+class _TotalVariation(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, values: Tensor, vertex: Tensor, index: Tensor, first: int, last: int) -> Tensor:
-        slope, sums = torch.empty(last - first), np.zeros(cpu.compile.workers())
-        cpu.voxels.roughness(values, vertex, index, side_of(index), first, slope, sums)
+    def forward(ctx, values: Tensor, vertex_of_row: Tensor, index: Tensor, first: int, last: int) -> Tensor:
+        slope, sums = torch.empty(last - first), np.zeros(cpu.jit.sync_num_threads())
+        cpu.voxels.total_variation(values, vertex_of_row, index, grid_side(index), first, slope, sums)
         ctx.slope, ctx.run, ctx.rows = slope, slice(first, last), len(values)
         return torch.tensor(sums.sum() / (last - first), dtype=torch.float32)
 
     @staticmethod
-    def backward(ctx, above: Tensor) -> tuple[Tensor, None, None, None, None]:
+    def backward(ctx, grad_output: Tensor) -> tuple[Tensor, None, None, None, None]:
         grad = torch.zeros(ctx.rows)
-        torch.mul(ctx.slope, 2 * above / len(ctx.slope), out=grad[ctx.run])
+        torch.mul(ctx.slope, 2 * grad_output / len(ctx.slope), out=grad[ctx.run])
         return grad, None, None, None, None
 
 
-@constant
+@cache_constants
 def _neighbours(side: int, device: torch.device) -> tuple[Int[Tensor, "6 1"], ...]:
     """For the six directions: the axis's stride, the step to the neighbour, and the coordinate that has no neighbour there."""
     strides = torch.tensor([side * side, side, 1], device=device).repeat(2)[:, None]
@@ -180,9 +182,11 @@ def _neighbours(side: int, device: torch.device) -> tuple[Int[Tensor, "6 1"], ..
     return strides, strides * signs, (signs > 0) * (side - 1)
 
 
-def roughness_reference(values: Tensor, vertex: Tensor, index: Tensor, first: int, last: int) -> Float[Tensor, ""]:
-    """`roughness` in plain PyTorch, for every device."""
-    side, at = side_of(index), vertex[first:last].long()
+def total_variation_reference(
+    values: Tensor, vertex_of_row: Tensor, index: Tensor, first: int, last: int
+) -> Float[Tensor, ""]:
+    """`total_variation` in plain PyTorch, for every device."""
+    side, at = grid_side(index), vertex_of_row[first:last].long()
     strides, ways, ends = _neighbours(side, index.device)
     inside = at // strides % side != ends
     # Row 0 stands for all that are not kept, and is used where there is no neighbour.
@@ -191,8 +195,8 @@ def roughness_reference(values: Tensor, vertex: Tensor, index: Tensor, first: in
     return (apart.square() * (other > 0)).sum() / (last - first)
 
 
-def roughness(
-    values: Float[Tensor, "V"], vertex: Int[Tensor, "V"], index: Int[Tensor, "cells"], first: int, last: int
+def total_variation(
+    values: Float[Tensor, "V"], vertex_of_row: Int[Tensor, "V"], index: Int[Tensor, "cells"], first: int, last: int
 ) -> Float[Tensor, ""]:
     """Mean over rows `first` to `last` of the sum of squared differences to those of the six neighbours that are kept.
 
@@ -200,8 +204,8 @@ def roughness(
 
     Args:
         values: of the kept vertices; row 0 is that of all others.
-        vertex: number of each row's vertex in the grid; row 0's is not read.
-        index: see `locate`.
+        vertex_of_row: number of each row's vertex in the grid; row 0's is not read.
+        index: see `locate_vertices`.
     """
-    version = _Roughness.apply if has_fast(values) else roughness_reference
-    return version(values, vertex, index, first, last)
+    version = _TotalVariation.apply if has_fast_kernel(values) else total_variation_reference
+    return version(values, vertex_of_row, index, first, last)

@@ -6,7 +6,7 @@ from nerf_lightning.model.hashgrid import HashGrid, HashGridField
 from nerf_lightning.model.hashgrid2d import HashGrid2DField
 from nerf_lightning.model.layers.activation import SoftenableReLU, density_activation, truncated_exp
 from nerf_lightning.model.layers.encoding import sinusoidal
-from nerf_lightning.model.layers.networks import as_wide
+from nerf_lightning.model.layers.networks import is_at_least_as_wide
 from nerf_lightning.model.mlp import MLPField
 from nerf_lightning.model.picture import FourierField, PictureMLP, SirenField
 from nerf_lightning.model.tensorf import TensoRFField, VectorMatrix
@@ -28,7 +28,7 @@ __all__ = [
     "TensoRFField",
     "VectorMatrix",
     "VoxelField",
-    "as_wide",
+    "is_at_least_as_wide",
     "density_activation",
     "sinusoidal",
     "truncated_exp",

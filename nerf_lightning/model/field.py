@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, InBounds
+from nerf_lightning.cameras import BoundedModule, Bounds
 from nerf_lightning.model.growth import ResolutionSchedule
 
 BYTES_PER_PARAMETER = 16
@@ -28,24 +28,24 @@ class FieldOutput(NamedTuple):
     """What the direction adds to the logits of the colour (SNeRG, Hedman et al. 2021); None where the field cannot tell."""
 
 
-class AnyField(torch.nn.Module):
+class BaseField(torch.nn.Module):
     """What fields in two and in three dimensions have in common."""
 
     max_lr: float = math.inf
     """Adam's learning rate above which training diverges, as the stability suite measured it; infinite if unknown."""
     growth: ResolutionSchedule | None = None
     """Of a field that is upsampled during training."""
-    sizing: str = ""
+    size_message: str = ""
     """One line on how the field's size follows from the data; "" if it does not."""
 
-    def values_grown(self) -> int:
+    def max_num_parameters(self) -> int:
         """How many numbers it will learn at its full size, as far as that is known beforehand."""
         return sum(parameter.numel() for parameter in self.parameters())
 
     @property
     def training_bytes(self) -> int:
         """Memory that it takes in training at least, at its largest."""
-        return BYTES_PER_PARAMETER * self.values_grown()
+        return BYTES_PER_PARAMETER * self.max_num_parameters()
 
     def warm_start_from(self, smaller: Any) -> None:
         """Copies the function of a smaller field of the same kind, as far as possible, leaving the rest free to learn.
@@ -66,7 +66,7 @@ class AnyField(torch.nn.Module):
         self.load_state_dict(state)
 
 
-class Field(InBounds, AnyField):
+class Field(BoundedModule, BaseField):
     """A radiance field in world coordinates. Subclasses define `features` and `colour`, or `density` and `forward`.
 
     Networks work in units of the bounds' half-size; `forward` and `density` convert to 1 / world unit, so that a scene in
@@ -84,19 +84,19 @@ class Field(InBounds, AnyField):
 
     def __init__(self, bounds: Bounds):
         super().__init__(bounds)
-        self.unit_length = bounds.longest
+        self.unit_length = bounds.max_half_size
 
-    def grid_sizes(self, coarsest: int, finest: int, size: Size) -> tuple[int, int]:
+    def limit_resolutions(self, base_resolution: int, max_resolution: int, size: Size) -> tuple[int, int]:
         """Cells along a side of the coarsest and the finest grid: as given, or with "auto" no more than the photos can show."""
-        across = self.bounds.pixels_across
+        across = self.bounds.unit_cube_pixels
         if size == "fixed" or across == math.inf:
-            return coarsest, finest
+            return base_resolution, max_resolution
         shown = max(math.ceil(MAX_CELLS_PER_PIXEL * across), 2)
-        self.sizing = (
+        self.size_message = (
             f"the content is {across:.0f} pixels wide in the photos, which show {shown} cells a side at most:"
-            f" {min(finest, shown)} of {finest} wanted"
+            f" {min(max_resolution, shown)} of {max_resolution} wanted"
         )
-        return min(coarsest, shown), min(finest, shown)
+        return min(base_resolution, shown), min(max_resolution, shown)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         """World positions -> density (1 / half-size, not negative) and what `colour` needs."""
@@ -118,7 +118,7 @@ class Field(InBounds, AnyField):
         """Regularization losses on what the field holds, by name."""
         return {}
 
-    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
         """Empties what no position in the reached cells of the unit cube reads; in those cells the field does not change."""
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
@@ -131,18 +131,18 @@ class Field(InBounds, AnyField):
         return FieldOutput(density / self.unit_length, self.colour(features, directions))
 
 
-class PictureField(AnyField):
+class PictureField(BaseField):
     """A picture as a function of position: subclasses define `forward`.
 
     Args:
         size: width and height of the picture in pixels, which decide how fine the field is.
-        rate: factor on the learning rate, above 0, so that one rate suits every kind of field.
+        lr_scale: factor on the learning rate, above 0, so that one rate suits every kind of field.
     """
 
-    def __init__(self, size: tuple[int, int], rate: float = 1.0):
+    def __init__(self, size: tuple[int, int], lr_scale: float = 1.0):
         super().__init__()
         self.size = size
-        self.rate = rate
+        self.lr_scale = lr_scale
 
     @property
     def nyquist(self) -> float:

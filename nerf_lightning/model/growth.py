@@ -33,7 +33,7 @@ class ResolutionSchedule:
         """The stage after this share of the training."""
         return max(stage for stage, start in enumerate(self.starts) if progress >= start)
 
-    def clamp_progress(self, progress: float, step: int, may_hurry: bool = True) -> float:
+    def clamp_progress(self, progress: float, step: int, allow_shortening: bool = True) -> float:
         """The share of the training to take the stage of, after `step` steps of which only few or many fitted into it.
 
         Args:
@@ -41,7 +41,7 @@ class ResolutionSchedule:
             step: steps done.
             may_hurry: whether `max_steps` counts.
         """
-        if may_hurry:
+        if allow_shortening:
             progress = max(progress, self.end * min(1.0, step / self.max_steps))
         return min(progress, self.end * step / self.min_steps) if step < self.min_steps else progress
 

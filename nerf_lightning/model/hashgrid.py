@@ -9,33 +9,38 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import hash_interpolate, mlp, mlp_heads
-from nerf_lightning.kernels.hashgrid import Cells, corner_count, entry_of
+from nerf_lightning.kernels.hashgrid import GridCells, corner_count, entry_index
 from nerf_lightning.model.field import Field, FieldOutput, Size
 from nerf_lightning.model.layers.activation import Activation, density_activation
 from nerf_lightning.model.layers.encoding import encode_directions, num_sh_bases
-from nerf_lightning.model.layers.networks import layers, linears, weights, widen
-from nerf_lightning.model.layers.pruning import vertices_in
-from nerf_lightning.utils.options import Count, Entries, Layers, SHDegree, Side
+from nerf_lightning.model.layers.grid_masks import vertices_of_cells
+from nerf_lightning.model.layers.networks import build_layers, layer_parameters, linear_layers, widen
+from nerf_lightning.utils.option_checks import Count, GridSize, Layers, Log2Size, SHDegree
 
 
-def level_resolutions(levels: int, coarsest: int, finest: int) -> list[int]:
-    """Cells along each side of every level, growing geometrically from coarsest to finest (Instant-NGP, eq. 2 and 3).
+def level_resolutions(num_levels: int, base_resolution: int, max_resolution: int) -> list[int]:
+    """Cells along each side of every level, growing geometrically from base to maximum resolution (Instant-NGP, eq. 2 and 3).
 
     Raises:
-        InputError: where coarsest > finest.
+        InputError: where base_resolution > max_resolution.
     """
-    if coarsest > finest:
-        raise InputError("model.coarsest", "", f"{coarsest} with model.finest={finest}", "0 < coarsest <= finest")
-    growth = (finest / coarsest) ** (1 / max(levels - 1, 1))
-    return [round(coarsest * growth**level) for level in range(levels)]
+    if base_resolution > max_resolution:
+        raise InputError(
+            "model.base_resolution",
+            "",
+            f"{base_resolution} with model.max_resolution={max_resolution}",
+            "0 < base_resolution <= max_resolution",
+        )
+    growth = (max_resolution / base_resolution) ** (1 / max(num_levels - 1, 1))
+    return [round(base_resolution * growth**level) for level in range(num_levels)]
 
 
-def cubic_cells(levels: int, coarsest: int, finest: int) -> list[Cells]:
+def cubic_cells(num_levels: int, base_resolution: int, max_resolution: int) -> list[GridCells]:
     """Cells along each axis of every level of a grid of cubes, see `level_resolutions`."""
-    return [(side,) * 3 for side in level_resolutions(levels, coarsest, finest)]
+    return [(side,) * 3 for side in level_resolutions(num_levels, base_resolution, max_resolution)]
 
 
-def table_sizes(cells: Sequence[Cells], entries: int) -> list[int]:
+def table_sizes(cells: Sequence[GridCells], entries: int) -> list[int]:
     """Entries of each level's table: all corners of its grid where they fit."""
     return [min(corner_count(level), entries) for level in cells]
 
@@ -45,23 +50,23 @@ class HashGrid(torch.nn.Module):
 
     Args:
         cells: of each grid along each axis.
-        log2_entries: each level has at most 2^log2_entries entries; levels too fine for that share them by hashing.
-        features: numbers per entry.
+        log2_hashmap_size: each level has at most 2^log2_hashmap_size entries; levels too fine for that share them by hashing.
+        features_per_level: numbers per entry.
     """
 
-    def __init__(self, cells: Sequence[Cells], log2_entries: int, features: int):
+    def __init__(self, cells: Sequence[GridCells], log2_hashmap_size: int, features_per_level: int):
         super().__init__()
         self.cells = list(cells)
-        self.sizes = table_sizes(self.cells, 2**log2_entries)
-        self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features).uniform_(-1e-4, 1e-4))
-        self.width = len(self.cells) * features
+        self.sizes = table_sizes(self.cells, 2**log2_hashmap_size)
+        self.tables = torch.nn.Parameter(torch.empty(sum(self.sizes), features_per_level).uniform_(-1e-4, 1e-4))
+        self.width = len(self.cells) * features_per_level
 
     def forward(self, unit: Float[Tensor, "N D"]) -> Float[Tensor, "N LF"]:
         return hash_interpolate(self.tables, unit, self.cells, self.sizes)
 
     def rows(self, vertices: Int[Tensor, "D N"], level: int) -> Int[Tensor, "N"]:
         """Rows of `tables` that hold a level's vertices."""
-        return sum(self.sizes[:level]) + entry_of(vertices, self.cells[level], self.sizes[level])
+        return sum(self.sizes[:level]) + entry_index(vertices, self.cells[level], self.sizes[level])
 
     @torch.no_grad()
     def warm_start_from(self, smaller: "HashGrid") -> Int[Tensor, "I"] | None:
@@ -73,8 +78,8 @@ class HashGrid(torch.nn.Module):
         features = self.tables.shape[1]
         if features != smaller.tables.shape[1] or any(cells not in self.cells for cells in smaller.cells):
             return None
-        levels = [self.cells.index(cells) for cells in smaller.cells]
-        for its, mine in enumerate(levels):
+        matches = [self.cells.index(cells) for cells in smaller.cells]
+        for its, mine in enumerate(matches):
             cells, size = self.cells[mine], self.sizes[mine]
             if size == corner_count(cells):
                 vertices = torch.cartesian_prod(*(torch.arange(side + 1, dtype=torch.int32) for side in cells)).T
@@ -82,14 +87,14 @@ class HashGrid(torch.nn.Module):
             else:  # hashes differ only in how many of their bits are used
                 entries = sum(smaller.sizes[:its]) + torch.arange(size) % smaller.sizes[its]
                 self.tables[sum(self.sizes[:mine]) + torch.arange(size)] = smaller.tables[entries]
-        return (features * torch.tensor(levels)[:, None] + torch.arange(features)).flatten()
+        return (features * torch.tensor(matches)[:, None] + torch.arange(features)).flatten()
 
     @torch.no_grad()
-    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
         """Zeroes the entries that no position in the reached cells reads."""
-        read = torch.zeros(len(self.tables), dtype=torch.bool, device=reached.device)
+        read = torch.zeros(len(self.tables), dtype=torch.bool, device=find_visible_cells.device)
         for level, (side, *_) in enumerate(self.cells):
-            read[self.rows(vertices_in(reached, side).nonzero().T.int(), level)] = True
+            read[self.rows(vertices_of_cells(find_visible_cells, side).nonzero().T.int(), level)] = True
         self.tables[~read] = 0
 
 
@@ -98,74 +103,74 @@ class HashGridField(Field):
 
     Args:
         bounds: the box the grid covers.
-        levels: number of grids.
-        log2_entries, features: see `HashGrid`.
-        coarsest, finest: cells along a side of the first and the last grid.
+        num_levels: number of grids.
+        log2_hashmap_size, features_per_level: see `HashGrid`.
+        base_resolution, max_resolution: cells along a side of the first and the last grid.
         width: neurons of the hidden layers (one for density, two for colour).
         degree: see `TensoRFField`.
-        split_colour: whether a place has a colour of its own, to which the colour network adds what the direction changes
+        view_residual: whether a place has a colour of its own, to which the colour network adds what the direction changes
             (as in SNeRG, Hedman et al. 2021); otherwise the network makes all of the colour.
         density: "relu", "softplus" or "exp".
-        size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
+        size: "auto" lowers both resolutions to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest.
+        InputError: where base_resolution > max_resolution.
     """
 
-    GEOMETRY = 15  # features handed from density to colour network, Instant-NGP section 5.4
-    START = -1.0  # an exponential density starts as thin fog
+    GEOMETRY_FEATURES = 15  # features handed from density to colour network, Instant-NGP section 5.4
+    INIT_LOG_DENSITY = -1.0  # an exponential density starts as thin fog
     max_lr = 0.1
 
     def __init__(
         self,
         bounds: Bounds,
-        levels: Layers = 8,
-        log2_entries: Entries = 17,
-        features: Count = 2,
-        coarsest: Side = 16,
-        finest: Side = 256,
+        num_levels: Layers = 8,
+        log2_hashmap_size: Log2Size = 17,
+        features_per_level: Count = 2,
+        base_resolution: GridSize = 16,
+        max_resolution: GridSize = 256,
         width: Count = 64,
         degree: SHDegree = 3,
-        split_colour: bool = False,
+        view_residual: bool = False,
         density: Activation = "exp",
         size: Size = "auto",
     ):
         super().__init__(bounds)
-        cells = cubic_cells(levels, *self.grid_sizes(coarsest, finest, size))
-        self.grid = HashGrid(cells, log2_entries, features)
+        cells = cubic_cells(num_levels, *self.limit_resolutions(base_resolution, max_resolution, size))
+        self.grid = HashGrid(cells, log2_hashmap_size, features_per_level)
         self.activation = density_activation(density)
-        self.density_net = layers(self.grid.width, width, 1 + self.GEOMETRY)
+        self.density_net = build_layers(self.grid.width, width, 1 + self.GEOMETRY_FEATURES)
         self.terms = num_sh_bases(degree)
-        self.split_colour = split_colour
-        self.colour_net = layers(self.GEOMETRY + self.terms, width, width, 3)
-        self.starts_thin = density == "exp"
+        self.view_residual = view_residual
+        self.colour_net = build_layers(self.GEOMETRY_FEATURES + self.terms, width, width, 3)
+        self.has_exp_density = density == "exp"
         self.reset_parameters()
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
         """The layers drew their own. Starting from dense fog, training may remove all density, and all gradient with it."""
-        if self.starts_thin:
-            self.density_net[-1].get_parameter("bias")[0] = self.START
+        if self.has_exp_density:
+            self.density_net[-1].get_parameter("bias")[0] = self.INIT_LOG_DENSITY
 
     def warm_start_from(self, smaller: Field) -> None:
         """Copies a field that has no other levels, and makes colours alike."""
         assert isinstance(smaller, HashGridField)
-        if self.split_colour != smaller.split_colour or (columns := self.grid.warm_start_from(smaller.grid)) is None:
+        if self.view_residual != smaller.view_residual or (columns := self.grid.warm_start_from(smaller.grid)) is None:
             return
-        widen(linears(self.density_net), linears(smaller.density_net), columns)
-        widen(linears(self.colour_net), linears(smaller.colour_net))
+        widen(linear_layers(self.density_net), linear_layers(smaller.density_net), columns)
+        widen(linear_layers(self.colour_net), linear_layers(smaller.colour_net))
 
-    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        self.grid.prune(reached)
+    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
+        self.grid.prune(find_visible_cells)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         encoded = self.grid(self.bounds.to_unit(positions))
-        raw, geometry = mlp_heads(encoded, weights(self.density_net), 1)
+        raw, geometry = mlp_heads(encoded, layer_parameters(self.density_net), 1)
         return self.activation(raw.squeeze(1)), geometry
 
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
         density, features = self.features(positions)
-        logits = mlp(features, weights(self.colour_net), encode_directions(directions, self.terms))
-        if not self.split_colour:
+        logits = mlp(features, layer_parameters(self.colour_net), encode_directions(directions, self.terms))
+        if not self.view_residual:
             return FieldOutput(density / self.unit_length, torch.sigmoid(logits))
         return FieldOutput(density / self.unit_length, torch.sigmoid(features[:, :3] + logits), logits)

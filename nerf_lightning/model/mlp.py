@@ -9,8 +9,8 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model.field import Field
 from nerf_lightning.model.layers.activation import Activation, density_activation
 from nerf_lightning.model.layers.encoding import sinusoidal
-from nerf_lightning.model.layers.networks import linears, widen
-from nerf_lightning.utils.options import Count, Layers, Octaves
+from nerf_lightning.model.layers.networks import linear_layers, widen
+from nerf_lightning.utils.option_checks import Count, Frequencies, Layers
 
 
 class MLPField(Field):
@@ -36,8 +36,8 @@ class MLPField(Field):
         depth: Layers = 8,
         width: Count = 256,
         skip: int | None = 4,
-        position_frequencies: Octaves = 10,
-        direction_frequencies: Octaves = 4,
+        position_frequencies: Frequencies = 10,
+        direction_frequencies: Frequencies = 4,
         density: Activation = "relu",
     ):
         super().__init__(bounds)
@@ -64,7 +64,7 @@ class MLPField(Field):
         """Copies a network with the same encodings, both without a skip; further layers of the trunk pass on their input."""
         assert isinstance(smaller, MLPField)
         mine, its = ((f.skip, f.position_frequencies, f.direction_frequencies) for f in (self, smaller))
-        trunk, known = linears(self.trunk), linears(smaller.trunk)
+        trunk, known = linear_layers(self.trunk), linear_layers(smaller.trunk)
         if self.skip is not None or mine != its or len(known) > len(trunk):
             return
         narrow = smaller.bottleneck.out_features
@@ -74,7 +74,7 @@ class MLPField(Field):
             layer.bias[:narrow] = 0
         widen([self.density_head], [smaller.density_head])
         widen([self.bottleneck], [smaller.bottleneck])
-        head, its_head = linears(self.colour_head), linears(smaller.colour_head)
+        head, its_head = linear_layers(self.colour_head), linear_layers(smaller.colour_head)
         directions = torch.arange(self.bottleneck.out_features, head[0].in_features)
         widen(head, its_head, torch.cat([torch.arange(narrow), directions]))
 

@@ -8,11 +8,11 @@ from torch import Tensor
 
 from nerf_lightning.model.field import PictureField
 from nerf_lightning.model.layers.encoding import sinusoidal
-from nerf_lightning.model.layers.networks import layers, linears, widen
-from nerf_lightning.utils.options import Count, Layers, Octaves, Positive
+from nerf_lightning.model.layers.networks import build_layers, linear_layers, widen
+from nerf_lightning.utils.option_checks import Count, Frequencies, Layers, PositiveFloat
 
 
-def relu_layers(sizes: list[int]) -> torch.nn.Sequential:
+def build_relu_mlp(sizes: list[int]) -> torch.nn.Sequential:
     """Fully connected layers of the given widths with ReLU between them."""
     parts: list[torch.nn.Module] = [torch.nn.Linear(sizes[0], sizes[1])]
     for inputs, outputs in zip(sizes[1:-1], sizes[2:], strict=True):
@@ -32,25 +32,25 @@ class PictureMLP(PictureField):
     """
 
     def __init__(
-        self, size: tuple[int, int], frequencies: Octaves | None = None, width: Count = 256, depth: Layers = 3
+        self, size: tuple[int, int], num_frequencies: Frequencies | None = None, width: Count = 256, depth: Layers = 3
     ):
         super().__init__(size)
-        if frequencies is None:
+        if num_frequencies is None:
             # The last octave has 2^(L-1) / 2 cycles over the picture. At the Nyquist frequency itself a sine would have the
             # same value at all pixels, up to its sign, and anything between them.
-            frequencies = 1 + max(0, round(math.log2(self.nyquist)))
-        self.frequencies = frequencies
-        self.net = relu_layers([2 * (1 + 2 * frequencies), *[width] * depth, 3])
+            num_frequencies = 1 + max(0, round(math.log2(self.nyquist)))
+        self.num_frequencies = num_frequencies
+        self.net = build_relu_mlp([2 * (1 + 2 * num_frequencies), *[width] * depth, 3])
 
     def warm_start_from(self, smaller: PictureField) -> None:
         """Copies a network with as many layers and at most as many octaves, which come first here."""
         assert isinstance(smaller, PictureMLP)
-        if len(self.net) == len(smaller.net) and smaller.frequencies <= self.frequencies:
-            widen(linears(self.net), linears(smaller.net))
+        if len(self.net) == len(smaller.net) and smaller.num_frequencies <= self.num_frequencies:
+            widen(linear_layers(self.net), linear_layers(smaller.net))
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         places = 0.5 + 0.5 * self.centred(uv)  # pixels stay square: octaves that suit the longer side suit the shorter
-        return torch.sigmoid(self.net(sinusoidal(places, self.frequencies)))
+        return torch.sigmoid(self.net(sinusoidal(places, self.num_frequencies)))
 
 
 class FourierField(PictureField):
@@ -58,27 +58,27 @@ class FourierField(PictureField):
 
     Args:
         size: see `PictureField`.
-        features: number of random frequencies; each gives a sine and a cosine.
-        spread: standard deviation of the frequencies, as a share of the Nyquist frequency.
+        num_frequencies: number of random frequencies; each gives a sine and a cosine.
+        frequency_std: standard deviation of the frequencies, as a share of the Nyquist frequency.
         width: neurons of each hidden layer.
         depth: hidden layers.
-        rate: factor on the learning rate.
+        lr_scale: factor on the learning rate.
     """
 
     def __init__(
         self,
         size: tuple[int, int],
-        features: Count = 256,
-        spread: Positive = 0.1,
+        num_frequencies: Count = 256,
+        frequency_std: PositiveFloat = 0.1,
         width: Count = 256,
         depth: Layers = 3,
-        rate: Positive = 1.0,
+        lr_scale: PositiveFloat = 1.0,
     ):
-        super().__init__(size, rate)
+        super().__init__(size, lr_scale)
         self.cycles: Tensor
-        """[2, features], over the picture's longer side; the seed decides them, and checkpoints keep them."""
-        self.register_buffer("cycles", torch.randn(2, features) * spread * self.nyquist)
-        self.net = relu_layers([2 * features, *[width] * depth, 3])
+        """[2, num_frequencies], over the picture's longer side; the seed decides them, and checkpoints keep them."""
+        self.register_buffer("cycles", torch.randn(2, num_frequencies) * frequency_std * self.nyquist)
+        self.net = build_relu_mlp([2 * num_frequencies, *[width] * depth, 3])
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
         angles = math.pi * self.centred(uv) @ self.cycles  # the longer side is 2 units long
@@ -92,20 +92,25 @@ class SirenField(PictureField):
         size: see `PictureField`.
         width: neurons of each hidden layer.
         depth: hidden layers.
-        reach: angular frequency of the first layer as a share of the Nyquist frequency; 0.075 gives the paper's 30 for a
+        first_frequency: angular frequency of the first layer in Nyquist frequencies; 0.075 gives the paper's 30 for a
             picture of 256 pixels.
-        rate: factor on the learning rate.
+        lr_scale: factor on the learning rate.
     """
 
     HIDDEN_FREQUENCY = 30.0  # omega_0 of the later layers, which the paper keeps whatever the signal
 
     def __init__(
-        self, size: tuple[int, int], width: Count = 256, depth: Layers = 3, reach: Positive = 0.15, rate: Positive = 0.1
+        self,
+        size: tuple[int, int],
+        width: Count = 256,
+        depth: Layers = 3,
+        first_frequency: PositiveFloat = 0.15,
+        lr_scale: PositiveFloat = 0.1,
     ):
-        super().__init__(size, rate)
+        super().__init__(size, lr_scale)
         # In radians per unit; the longer side is 2 units long.
-        self.first_frequency = reach * math.pi * self.nyquist
-        self.hidden = layers(2, *[width] * depth)
+        self.first_frequency = first_frequency * math.pi * self.nyquist
+        self.hidden = build_layers(2, *[width] * depth)
         self.last = torch.nn.Linear(width, 3)
         self.reset_parameters()
 

@@ -10,19 +10,19 @@ from torch.nn.functional import interpolate
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import mlp, plane_line_sum, plane_line_sum_and_products
-from nerf_lightning.kernels.planes import PLANE_AXES
+from nerf_lightning.kernels.vector_matrix import PLANE_AXES
 from nerf_lightning.model.field import Field, Size
 from nerf_lightning.model.growth import ResolutionSchedule, replace_data
 from nerf_lightning.model.hashgrid import level_resolutions
 from nerf_lightning.model.layers.activation import Activation, density_activation
 from nerf_lightning.model.layers.encoding import encode_directions, num_sh_bases
-from nerf_lightning.model.layers.networks import layers, linears, weights, widen
-from nerf_lightning.model.layers.pruning import vertices_in
-from nerf_lightning.utils.options import Count, Fraction, Layers, SHDegree, Side
+from nerf_lightning.model.layers.grid_masks import vertices_of_cells
+from nerf_lightning.model.layers.networks import build_layers, layer_parameters, linear_layers, widen
+from nerf_lightning.utils.option_checks import Count, Fraction, GridSize, Layers, SHDegree
 
-FINEST = 160
+DEFAULT_MAX_RESOLUTION = 160
 """Cells along a side at the end, where photos are of usual size."""
-WIDTH = 32
+DEFAULT_WIDTH = 32
 """Neurons of the hidden layer there."""
 MIN_STEPS_PER_STAGE, MAX_STEPS_PER_STAGE = 80, 1000
 """Steps that a stage needs before the next is worth its time, and after which it has learned what it can."""
@@ -36,20 +36,20 @@ class VectorMatrix(torch.nn.Module):
         components: channels of each of the three planes, and of the lines across them.
     """
 
-    SPREAD = 0.1  # standard deviation at the start, as in the authors' code
+    INIT_STD = 0.1  # standard deviation at the start, as in the authors' code
 
     def __init__(self, cells: int, components: int):
         super().__init__()
         side = cells + 1
-        self.planes = torch.nn.Parameter(self.SPREAD * torch.randn(3, side, side, components))
-        self.lines = torch.nn.Parameter(self.SPREAD * torch.randn(3, side, components))
+        self.planes = torch.nn.Parameter(self.INIT_STD * torch.randn(3, side, side, components))
+        self.lines = torch.nn.Parameter(self.INIT_STD * torch.randn(3, side, components))
 
     @property
     def cells(self) -> int:
         """Current cells along each side."""
         return self.lines.shape[1] - 1
 
-    def total(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+    def sum_components(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """The sum of all components at positions in the unit cube."""
         return plane_line_sum(self.planes, self.lines, unit)
 
@@ -64,24 +64,24 @@ class VectorMatrix(torch.nn.Module):
         replace_data(self.lines, lines.transpose(1, 2).contiguous())
 
     @torch.no_grad()
-    def warm_start_from(self, smaller: "VectorMatrix", silent: bool) -> None:
+    def warm_start_from(self, smaller: "VectorMatrix", zero_init: bool) -> None:
         """Copies another volume's components and its size; further components are new.
 
         Args:
             smaller: with at most as many components.
-            silent: whether the new ones add nothing at first, by lines of zero.
+            zero_init: whether the new ones add nothing at first, by lines of zero.
         """
         new = self.lines.shape[2] - smaller.lines.shape[2]
-        planes, lines = (self.SPREAD * torch.randn(*old.shape[:-1], new) for old in (smaller.planes, smaller.lines))
-        if silent:
+        planes, lines = (self.INIT_STD * torch.randn(*old.shape[:-1], new) for old in (smaller.planes, smaller.lines))
+        if zero_init:
             lines.zero_()
         replace_data(self.planes, torch.cat([smaller.planes, planes], dim=3))
         replace_data(self.lines, torch.cat([smaller.lines, lines], dim=2))
 
     @torch.no_grad()
-    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
+    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
         """Zeroes the vertices that no position in the reached cells reads."""
-        read = vertices_in(reached, self.cells)
+        read = vertices_of_cells(find_visible_cells, self.cells)
         for mode in range(3):
             self.planes[mode][~read.any(mode)] = 0
             a, b = PLANE_AXES[mode]
@@ -106,20 +106,20 @@ class TensoRFField(Field):
     Args:
         bounds: the box the planes cover.
         density_components, colour_components: channels of each plane. Multiples of 8 are the fast ones on a CPU.
-        coarsest, finest: cells along a side at the start and at the end. Without a finest: 160, and more for larger photos, see
-            `Bounds.fineness`.
+        base_resolution, max_resolution: cells along a side at the start and the end. None: 160, more for larger photos, see
+            `Bounds.resolution_scale`.
         stages: number of sizes, growing geometrically.
-        grown: fraction of the budget after which the planes have their finest size; the stages before are equally long, of at
+        growth_end: fraction of the budget after which the planes have their finest size; earlier stages are equally long, of at
             least `MIN_STEPS_PER_STAGE` and at most `MAX_STEPS_PER_STAGE` steps.
         width: neurons of the hidden layer. Without a width: 32, and up to 64 where planes are finer for larger photos, which
             show more of how surfaces shine.
         degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0, colours are the same from
             everywhere. With few photos, less than 3 may be better.
         density: "relu", "softplus" or "exp".
-        size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
+        size: "auto" lowers both resolutions to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest, and for a single stage of two sizes.
+        InputError: where base_resolution > max_resolution, and for a single stage of two sizes.
     """
 
     max_lr = 0.2
@@ -129,39 +129,41 @@ class TensoRFField(Field):
         bounds: Bounds,
         density_components: Count = 16,
         colour_components: Count = 16,
-        coarsest: Side = 64,
-        finest: Side | None = None,
+        base_resolution: GridSize = 64,
+        max_resolution: GridSize | None = None,
         stages: Layers = 4,
-        grown: Fraction = 0.3,
+        growth_end: Fraction = 0.3,
         width: Count | None = None,
         degree: SHDegree = 3,
         density: Activation = "exp",
         size: Size = "auto",
     ):
         super().__init__(bounds)
-        self.follows_photos = finest is None
-        finer = bounds.fineness if finest is None else 1.0
-        if finest is None:
-            finest = max(coarsest, round(FINEST * finer))
+        self.has_auto_resolution = max_resolution is None
+        finer = bounds.resolution_scale if max_resolution is None else 1.0
+        if max_resolution is None:
+            max_resolution = max(base_resolution, round(DEFAULT_MAX_RESOLUTION * finer))
         if width is None:
-            width = 8 * round(WIDTH * finer / 8)
-        coarsest, finest = self.grid_sizes(coarsest, finest, size)
-        if stages == 1 and coarsest < finest:
-            raise InputError("model.stages", "", f"1 with sizes {coarsest} and {finest}", "at least 2, or one size")
-        self.resolutions = level_resolutions(stages, coarsest, finest)
-        if coarsest < finest:
-            starts = [grown * i / (stages - 1) for i in range(stages)]
+            width = 8 * round(DEFAULT_WIDTH * finer / 8)
+        base_resolution, max_resolution = self.limit_resolutions(base_resolution, max_resolution, size)
+        if stages == 1 and base_resolution < max_resolution:
+            raise InputError(
+                "model.stages", "", f"1 with sizes {base_resolution} and {max_resolution}", "at least 2, or one size"
+            )
+        self.resolutions = level_resolutions(stages, base_resolution, max_resolution)
+        if base_resolution < max_resolution:
+            starts = [growth_end * i / (stages - 1) for i in range(stages)]
             steps = MIN_STEPS_PER_STAGE * (stages - 1), MAX_STEPS_PER_STAGE * (stages - 1)
             self.growth = ResolutionSchedule(self.resolutions, starts, *steps)
-        self.density_volume = VectorMatrix(coarsest, density_components)
-        self.colour_volume = VectorMatrix(coarsest, colour_components)
+        self.density_volume = VectorMatrix(base_resolution, density_components)
+        self.colour_volume = VectorMatrix(base_resolution, colour_components)
         self.activation = density_activation(density)
         self.terms = num_sh_bases(degree)
-        self.colour_net = layers(3 * colour_components + self.terms, width, 3)
+        self.colour_net = build_layers(3 * colour_components + self.terms, width, 3)
 
     @property
     def resolution_scale(self) -> float:
-        return max(1.0, self.density_volume.cells / FINEST) if self.follows_photos else 1.0
+        return max(1.0, self.density_volume.cells / DEFAULT_MAX_RESOLUTION) if self.has_auto_resolution else 1.0
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         density, colour = self.density_volume, self.colour_volume
@@ -171,34 +173,36 @@ class TensoRFField(Field):
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """As `forward` gives it, without computing the colour."""
-        return self.activation(self.density_volume.total(self.bounds.to_unit(positions))) / self.unit_length
+        return self.activation(self.density_volume.sum_components(self.bounds.to_unit(positions))) / self.unit_length
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(mlp(features, weights(self.colour_net), encode_directions(directions, self.terms)))
+        return torch.sigmoid(
+            mlp(features, layer_parameters(self.colour_net), encode_directions(directions, self.terms))
+        )
 
-    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        self.density_volume.prune(reached)
-        self.colour_volume.prune(reached)
+    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
+        self.density_volume.prune(find_visible_cells)
+        self.colour_volume.prune(find_visible_cells)
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
         """Copies everything and refines it to the finest size at once: the coarse sizes have done their work."""
         assert isinstance(smaller, TensoRFField)
         # Densities are a plain sum; new colour components have no effect while their weights are zero.
-        self.density_volume.warm_start_from(smaller.density_volume, silent=True)
-        self.colour_volume.warm_start_from(smaller.colour_volume, silent=False)
+        self.density_volume.warm_start_from(smaller.density_volume, zero_init=True)
+        self.colour_volume.warm_start_from(smaller.colour_volume, zero_init=False)
         for volume in (self.density_volume, self.colour_volume):
             if volume.cells < self.resolutions[-1]:
                 volume.resize(self.resolutions[-1])
         has, had = (volume.lines.shape[2] for volume in (self.colour_volume, smaller.colour_volume))
         products = [mode * has + one for mode in range(3) for one in range(had)]
         columns = torch.tensor([*products, *range(3 * has, 3 * has + smaller.terms)])
-        widen(linears(self.colour_net), linears(smaller.colour_net), columns)
+        widen(linear_layers(self.colour_net), linear_layers(smaller.colour_net), columns)
 
-    def values_grown(self) -> int:
+    def max_num_parameters(self) -> int:
         components = self.density_volume.lines.shape[2] + self.colour_volume.lines.shape[2]
         now, last = self.density_volume.cells + 1, self.resolutions[-1] + 1
-        return super().values_grown() + 3 * components * (last * last + last - now * now - now)
+        return super().max_num_parameters() + 3 * components * (last * last + last - now * now - now)
 
     @property
     def stage(self) -> int:

@@ -11,28 +11,28 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.kernels import (
     interpolate_rows,
-    locate,
+    interpolate_scalar,
+    interpolate_voxels,
+    locate_vertices,
     mark_rows,
-    read_voxels,
-    roughness,
-    voxel_value,
+    total_variation,
 )
 from nerf_lightning.model.field import Field, FieldOutput, Size
 from nerf_lightning.model.growth import ResolutionSchedule, replace_data
 from nerf_lightning.model.hashgrid import level_resolutions
 from nerf_lightning.model.layers.activation import truncated_exp
 from nerf_lightning.model.layers.encoding import encode_directions, num_sh_bases
-from nerf_lightning.model.layers.pruning import vertices_in, widened
-from nerf_lightning.utils.options import Above, AtMost, Layers, Positive, SHDegree, Side, Weight
+from nerf_lightning.model.layers.grid_masks import dilate, vertices_of_cells
+from nerf_lightning.utils.option_checks import GridSize, Gt, Layers, Le, LossWeight, PositiveFloat, SHDegree
 
-EMPTY = -8.0
+EMPTY_LOG_DENSITY = -8.0
 """Logarithm of the density (in 1 / half-size) where no vertex is kept: too thin to matter."""
-RECENT = 0.5
+VISIBILITY_WINDOW = 0.5
 """The last part of a stage; vertices read in it are kept."""
-PIECES = 4
+TV_SLICES = 4
 """Each step measures the roughness of one of this many pieces of the table."""
-TABLES = ("log_density", "colours", "views")
-CHUNK = 1 << 16
+TABLE_NAMES = ("log_density", "colours", "sh_coefficients")
+VERTICES_PER_CHUNK = 1 << 16
 """Vertices interpolated at a time when growing, to bound the memory."""
 
 BYTES_PER_VERTEX = 14
@@ -49,69 +49,71 @@ class VoxelField(Field):
 
     Args:
         bounds: the box the grid covers.
-        coarsest, finest: cells along a side at the start and at the end.
+        base_resolution, max_resolution: cells along a side at the start and at the end.
         stages: number of sizes, growing geometrically.
-        grown: fraction of the budget after which the grid has its finest size.
+        growth_end: fraction of the budget after which the grid has its finest size.
         degree: of the spherical harmonics, 0 to 3; those above 0 depend on the direction.
-        density_rate: factor on the learning rate of the log-densities, relative to the colours'.
-        smoothness: weight of the log-densities' squared differences between neighbours (Plenoxels, eq. 3, without the root).
-        size: "auto" lowers `finest`, and `coarsest` with it, to what the photos can show; "fixed" takes them as they are.
+        density_lr_scale: factor on the learning rate of the log-densities, relative to the colours'.
+        tv_weight: weight of the log-densities' squared differences between neighbours (Plenoxels, eq. 3, without the root).
+        size: "auto" lowers both resolutions to what the photos can show; "fixed" takes them as they are.
 
     Raises:
-        InputError: where coarsest > finest.
+        InputError: where base_resolution > max_resolution.
     """
 
     index: Tensor
     """Row of every vertex; 0 for those that are not kept."""
-    vertex: Tensor
+    vertex_of_row: Tensor
     """Vertex of every row, its inverse."""
-    seen: Tensor
+    last_read_step: Tensor
     """Step of the last reading of every row."""
 
     def __init__(
         self,
         bounds: Bounds,
-        coarsest: Side = 40,
-        finest: Side = 128,
+        base_resolution: GridSize = 40,
+        max_resolution: GridSize = 128,
         stages: Layers = 4,
-        grown: Annotated[float, Above(0), AtMost(1)] = 0.3,
+        growth_end: Annotated[float, Gt(0), Le(1)] = 0.3,
         degree: SHDegree = 1,
-        density_rate: Positive = 6.0,
-        smoothness: Weight = 1e-4,
+        density_lr_scale: PositiveFloat = 6.0,
+        tv_weight: LossWeight = 1e-4,
         size: Size = "auto",
     ):
         super().__init__(bounds)
-        coarsest, finest = self.grid_sizes(coarsest, finest, size)
+        base_resolution, max_resolution = self.limit_resolutions(base_resolution, max_resolution, size)
         # Early stages are short: a coarse grid learns what it can in a few steps a vertex.
-        starts = [grown * (i / max(stages - 1, 1)) ** 2 for i in range(stages)]
-        self.growth: ResolutionSchedule = ResolutionSchedule(level_resolutions(stages, coarsest, finest), starts)
+        starts = [growth_end * (i / max(stages - 1, 1)) ** 2 for i in range(stages)]
+        self.growth: ResolutionSchedule = ResolutionSchedule(
+            level_resolutions(stages, base_resolution, max_resolution), starts
+        )
         self.terms = num_sh_bases(degree) - 1  # without the constant one
-        self.density_rate = density_rate
+        self.density_lr_scale = density_lr_scale
         # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog in front of cameras.
-        self.max_lr = 1 / density_rate
-        self.smoothness = smoothness
-        for name, persistent in (("index", True), ("vertex", False), ("seen", True)):
+        self.max_lr = 1 / density_lr_scale
+        self.tv_weight = tv_weight
+        for name, persistent in (("index", True), ("vertex_of_row", False), ("last_read_step", True)):
             self.register_buffer(name, None, persistent)
-        self.stage, self.steps, self.started = 0, 1, 1
+        self.stage, self.steps, self.stage_start = 0, 1, 1
         """Of `growth`, steps so far, and the first one of the stage; on the host, as a step must not ask a device for them."""
         vertices = (self.growth.resolutions[0] + 1) ** 3
         self.log_density = torch.nn.Parameter(torch.zeros(1 + vertices))  # divided by density_rate
-        self.log_density.data[0] = EMPTY / density_rate
+        self.log_density.data[0] = EMPTY_LOG_DENSITY / density_lr_scale
         self.colours = torch.nn.Parameter(torch.zeros(1 + vertices, 3))
-        self.views = torch.nn.Parameter(torch.zeros(1 + vertices, 3 * self.terms))
+        self.sh_coefficients = torch.nn.Parameter(torch.zeros(1 + vertices, 3 * self.terms))
         self.set_vertices(torch.ones(vertices, dtype=torch.bool), [table.data for table in self.tables])
 
     @property
     def tables(self) -> tuple[torch.nn.Parameter, torch.nn.Parameter, torch.nn.Parameter]:
         """All that vertices hold, one row per vertex."""
-        return self.log_density, self.colours, self.views
+        return self.log_density, self.colours, self.sh_coefficients
 
     @property
     def training_bytes(self) -> int:
         return max(super().training_bytes, BYTES_PER_VERTEX * (self.growth.resolutions[-1] + 1) ** 3)
 
     @property
-    def kept(self) -> Bool[Tensor, "V"]:
+    def occupied(self) -> Bool[Tensor, "V"]:
         """Which vertices of the grid hold values."""
         return self.index > 0
 
@@ -120,44 +122,44 @@ class VoxelField(Field):
         """Current vertices along each side, kept or not."""
         return round(len(self.index) ** (1 / 3))
 
-    def per_length(self, raw: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
+    def density_from_raw(self, raw: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
         """Densities from what the table holds, 1 / world unit."""
-        return truncated_exp(self.density_rate * raw) / self.unit_length
+        return truncated_exp(self.density_lr_scale * raw) / self.unit_length
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """As `forward` gives it, but without marking the vertices as read."""
-        return self.per_length(voxel_value(self.log_density, self.index, self.bounds.to_unit(positions)))
+        return self.density_from_raw(interpolate_scalar(self.log_density, self.index, self.bounds.to_unit(positions)))
 
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
-        rows, weights = locate(self.index, self.bounds.to_unit(positions))
+        rows, weights = locate_vertices(self.index, self.bounds.to_unit(positions))
         basis = encode_directions(directions, 1 + self.terms)[:, 1:]
-        raw, rgb = read_voxels(self.log_density, self.colours, self.views, rows, weights, basis)
+        raw, rgb = interpolate_voxels(self.log_density, self.colours, self.sh_coefficients, rows, weights, basis)
         if torch.is_grad_enabled():
-            self.mark(rows)
-        return FieldOutput(self.per_length(raw), torch.sigmoid(rgb))
+            self.mark_read(rows)
+        return FieldOutput(self.density_from_raw(raw), torch.sigmoid(rgb))
 
     @torch.compiler.disable  # each step would be compiled again
-    def mark(self, rows: Int[Tensor, "N 8"]) -> None:
+    def mark_read(self, rows: Int[Tensor, "N 8"]) -> None:
         """Notes that a training step read these rows."""
         self.steps += 1
-        mark_rows(self.seen, rows, self.steps)
+        mark_rows(self.last_read_step, rows, self.steps)
 
     def losses(self) -> dict[str, Float[Tensor, ""]]:
         """The total variation of the log-densities, of another piece of the table in each step."""
-        rows, piece = len(self.vertex) - 1, self.steps % PIECES
-        first, last = (1 + rows * i // PIECES for i in (piece, piece + 1))
-        if not self.smoothness or first == last:
+        rows, piece = len(self.vertex_of_row) - 1, self.steps % TV_SLICES
+        first, last = (1 + rows * i // TV_SLICES for i in (piece, piece + 1))
+        if not self.tv_weight or first == last:
             return {}
-        return {"tv": self.smoothness * roughness(self.log_density, self.vertex, self.index, first, last)}
+        return {"tv": self.tv_weight * total_variation(self.log_density, self.vertex_of_row, self.index, first, last)}
 
     @torch.no_grad()
     def upsample(self, stage: int) -> list[torch.nn.Parameter]:
-        keep = self.surroundings(self.growth.resolutions[stage] + 1)
+        keep = self.vertices_to_keep(self.growth.resolutions[stage] + 1)
         values = torch.cat([table.view(len(table), -1) for table in self.tables], dim=1)
-        parts = (keep.nonzero() / (keep.shape[0] - 1)).split(CHUNK)
-        new = torch.cat([values[:1], *(interpolate_rows(values, *locate(self.index, part)) for part in parts)])
+        parts = (keep.nonzero() / (keep.shape[0] - 1)).split(VERTICES_PER_CHUNK)
+        new = torch.cat([values[:1], *(interpolate_rows(values, *locate_vertices(self.index, part)) for part in parts)])
         self.set_vertices(keep.flatten(), new.split([1, 3, 3 * self.terms], dim=1))
-        self.stage, self.started = stage, self.steps + 1
+        self.stage, self.stage_start = stage, self.steps + 1
         return list(self.tables)
 
     def set_vertices(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
@@ -166,8 +168,8 @@ class VoxelField(Field):
             replace_data(table, columns.reshape(len(columns), *table.shape[1:]).contiguous())
         self.index = torch.where(keep, keep.cumsum(0), 0).int()
         rows = self.index.nonzero()[:, 0]  # in the order of their vertices
-        self.vertex = torch.cat([rows.new_tensor([-1]), rows]).int()
-        self.seen = torch.zeros(len(self.vertex), dtype=torch.int32, device=keep.device)
+        self.vertex_of_row = torch.cat([rows.new_tensor([-1]), rows]).int()
+        self.last_read_step = torch.zeros(len(self.vertex_of_row), dtype=torch.int32, device=keep.device)
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
@@ -178,29 +180,31 @@ class VoxelField(Field):
         if cells > resolutions[-1]:
             return
         self.growth = replace(self.growth, resolutions=level_resolutions(len(resolutions), cells, resolutions[-1]))
-        views = smaller.views.view(len(smaller.views), 3, smaller.terms)[..., : self.terms]
-        wider = views.new_zeros(len(views), 3, self.terms)
-        wider[..., : views.shape[2]] = views
-        density = smaller.log_density * (smaller.density_rate / self.density_rate)
-        self.set_vertices(smaller.kept, [density, smaller.colours.detach(), wider.flatten(1)])
+        sh_coefficients = smaller.sh_coefficients.view(len(smaller.sh_coefficients), 3, smaller.terms)[
+            ..., : self.terms
+        ]
+        wider = sh_coefficients.new_zeros(len(sh_coefficients), 3, self.terms)
+        wider[..., : sh_coefficients.shape[2]] = sh_coefficients
+        density = smaller.log_density * (smaller.density_lr_scale / self.density_lr_scale)
+        self.set_vertices(smaller.occupied, [density, smaller.colours.detach(), wider.flatten(1)])
 
     @torch.no_grad()
-    def prune(self, reached: Bool[Tensor, "G G G"]) -> None:
-        keep = vertices_in(reached, self.side - 1).flatten() & self.kept
+    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
+        keep = vertices_of_cells(find_visible_cells, self.side - 1).flatten() & self.occupied
         rows = torch.cat([self.index.new_zeros(1), self.index[keep]]).long()
         self.set_vertices(keep, [table.detach()[rows] for table in self.tables])
 
     def export_state(self) -> dict[str, Tensor]:
-        tables = zip(TABLES, self.tables, strict=True)
-        return {"kept": self.kept, **{name: table.detach() for name, table in tables}}
+        tables = zip(TABLE_NAMES, self.tables, strict=True)
+        return {"occupied": self.occupied, **{name: table.detach() for name, table in tables}}
 
     def import_state(self, state: dict[str, Tensor]) -> None:
-        tables = {name: state[name] for name in TABLES}
-        self.load_state_dict({"index": state["kept"].int(), **tables}, strict=False)
+        tables = {name: state[name] for name in TABLE_NAMES}
+        self.load_state_dict({"index": state["occupied"].int(), **tables}, strict=False)
 
-    def surroundings(self, side: int) -> Bool[Tensor, "S S S"]:
+    def vertices_to_keep(self, side: int) -> Bool[Tensor, "S S S"]:
         """Which vertices of a grid of side^3 lie among current vertices that were read lately, or next to those."""
-        fresh = self.seen > self.steps - RECENT * (self.steps + 1 - self.started)
+        fresh = self.last_read_step > self.steps - VISIBILITY_WINDOW * (self.steps + 1 - self.stage_start)
         fresh[0] = False
         old = self.side
         keep = fresh[self.index.long()].view(old, old, old)
@@ -208,13 +212,13 @@ class VoxelField(Field):
         for axis in range(3):
             keep = keep.index_select(axis, at.floor().long()) & keep.index_select(axis, at.ceil().long())
         # Before anything was rendered, everything stays.
-        return widened(keep) if keep.any() else torch.ones_like(keep)
+        return dilate(keep) if keep.any() else torch.ones_like(keep)
 
     def get_extra_state(self) -> Tensor:
-        return torch.tensor([self.stage, self.steps, self.started])
+        return torch.tensor([self.stage, self.steps, self.stage_start])
 
     def set_extra_state(self, state: Tensor) -> None:
-        self.stage, self.steps, self.started = state.tolist()
+        self.stage, self.steps, self.stage_start = state.tolist()
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """Takes the size of the loaded state: a grid of another stage has other shapes.

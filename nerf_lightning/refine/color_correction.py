@@ -22,14 +22,14 @@ class ColorCorrection(torch.nn.Module):
         exposures: light that each photo gathered, in any unit, as its file states; empty where that is not known.
         affine: whether the colours of each photo are mixed and shifted too.
         vignetting: whether photos may be darker toward their corners, all alike.
-        fixed_mean: whether the mean of all gains stays 1, so that the scene does not grow brighter.
+        fix_mean: whether the mean of all gains stays 1, so that the scene does not grow brighter.
 
     Raises:
         InputError: for vignetting of photos of all directions.
     """
 
-    stated: Tensor
-    axes: Tensor
+    exif_log_gains: Tensor
+    optical_axes: Tensor
 
     def __init__(
         self,
@@ -37,23 +37,25 @@ class ColorCorrection(torch.nn.Module):
         exposures: Sequence[float] = (),
         affine: bool = False,
         vignetting: bool = False,
-        fixed_mean: bool = True,
+        fix_mean: bool = True,
     ):
         super().__init__()
         lenses = cameras.lenses
         if vignetting and lenses is not None and bool((lenses.projection == Projection.EQUIRECTANGULAR).any()):
             raise InputError("refine.vignetting", "", "true, with photos of all directions", "false for these")
         logs = torch.tensor(exposures).log() / GAMMA if exposures else torch.zeros(len(cameras))
-        self.register_buffer("stated", (logs - logs.mean())[:, None].expand(-1, 3).clone(), persistent=False)
-        self.register_buffer("axes", cameras.c2w[:, :3, 2].clone(), persistent=False)
+        self.register_buffer("exif_log_gains", (logs - logs.mean())[:, None].expand(-1, 3).clone(), persistent=False)
+        self.register_buffer("optical_axes", cameras.c2w[:, :3, 2].clone(), persistent=False)
         half = cameras.sizes.to(cameras.K) / 2
         corners = torch.maximum(cameras.K[:, :2, 2], 2 * half - cameras.K[:, :2, 2])
-        self.corner_tangent_squared = float((corners / cameras.K[:, [0, 1], [0, 1]]).square().sum(1).max())
+        self.corner_tan_squared = float((corners / cameras.K[:, [0, 1], [0, 1]]).square().sum(1).max())
         """Of the angle to the axis in the farthest corner."""
         self.log_gains = torch.nn.Parameter(torch.zeros(len(cameras), 3), requires_grad=False)
-        self.mixing = torch.nn.Parameter(torch.zeros(len(cameras), 3, 4), requires_grad=False) if affine else None
-        self.falloff = torch.nn.Parameter(torch.zeros(2), requires_grad=False) if vignetting else None
-        self.fixed_mean = fixed_mean
+        self.color_matrices = (
+            torch.nn.Parameter(torch.zeros(len(cameras), 3, 4), requires_grad=False) if affine else None
+        )
+        self.vignetting_coefficients = torch.nn.Parameter(torch.zeros(2), requires_grad=False) if vignetting else None
+        self.fix_mean = fix_mean
 
     @property
     def is_active(self) -> bool:
@@ -63,32 +65,35 @@ class ColorCorrection(torch.nn.Module):
     @property
     def gains(self) -> Float[Tensor, "V 3"]:
         """Factors on each photo's red, green and blue."""
-        return self._centred(self.log_gains).exp()
+        return self._subtract_mean(self.log_gains).exp()
 
     @property
     def corner_brightness(self) -> Float[Tensor, ""] | None:
         """Of the farthest corner, as a share of that on the axis, if photos may have vignetting."""
-        return None if self.falloff is None else (-self.falloff.sum()).exp()
+        return None if self.vignetting_coefficients is None else (-self.vignetting_coefficients.sum()).exp()
 
-    def use_stated(self) -> None:
+    def init_from_exif(self) -> None:
         """Starts from the exposures that files state."""
-        self.log_gains.data.copy_(self.stated)
+        self.log_gains.data.copy_(self.exif_log_gains)
 
-    def share_lens(self, other: "ColorCorrection") -> None:
+    def copy_lens(self, other: "ColorCorrection") -> None:
         """Takes the vignetting of another correction, not learned any further."""
-        self.falloff, self.corner_tangent_squared = copy.deepcopy(other.falloff), other.corner_tangent_squared
-        if self.falloff is not None:
-            self.falloff.requires_grad_(False)
+        self.vignetting_coefficients, self.corner_tan_squared = (
+            copy.deepcopy(other.vignetting_coefficients),
+            other.corner_tan_squared,
+        )
+        if self.vignetting_coefficients is not None:
+            self.vignetting_coefficients.requires_grad_(False)
 
-    def _centred(self, values: Float[Tensor, "V *K"]) -> Float[Tensor, "V *K"]:
-        return values - values.mean(0) if self.fixed_mean else values
+    def _subtract_mean(self, values: Float[Tensor, "V *K"]) -> Float[Tensor, "V *K"]:
+        return values - values.mean(0) if self.fix_mean else values
 
     def forward(
         self,
         rgb: Float[Tensor, "R 3"],
         opacity: Float[Tensor, "R"],
         backgrounds: Float[Tensor, "R 3"],
-        given: Rays,
+        rays: Rays,
         views: Int[Tensor, "R"],
         truth: Float[Tensor, "R 3"] | None = None,
     ) -> Float[Tensor, "R 3"]:
@@ -99,31 +104,33 @@ class ColorCorrection(torch.nn.Module):
         Args:
             rgb, opacity: rendered.
             backgrounds: colours behind.
-            given: the pixels' rays, by the cameras as given.
+            rays: the pixels' rays, by the cameras as given.
             views: the photos.
             truth: their own colours.
         """
         if not self.is_active:
             return rgb
-        behind = (1 - opacity)[:, None] * backgrounds
-        own = rgb - behind
-        shown = own * self.gains.index_select(0, views)
-        if self.mixing is not None:
-            matrix, shift = self._centred(self.mixing).index_select(0, views).split((3, 1), dim=2)
-            shown = shown + (matrix * own[:, None]).sum(2) + shift[..., 0] * opacity[:, None]
-        if self.falloff is not None:
-            shown = shown * self.shade(given.directions, views)
-        corrected = shown + behind
+        background = (1 - opacity)[:, None] * backgrounds
+        foreground = rgb - background
+        corrected_foreground = foreground * self.gains.index_select(0, views)
+        if self.color_matrices is not None:
+            matrix, shift = self._subtract_mean(self.color_matrices).index_select(0, views).split((3, 1), dim=2)
+            corrected_foreground = (
+                corrected_foreground + (matrix * foreground[:, None]).sum(2) + shift[..., 0] * opacity[:, None]
+            )
+        if self.vignetting_coefficients is not None:
+            corrected_foreground = corrected_foreground * self.compute_vignetting(rays.directions, views)
+        corrected = corrected_foreground + background
         return corrected if truth is None else torch.where(truth >= 1, corrected.clamp_max(1), corrected)
 
-    def shade(self, directions: Float[Tensor, "R 3"], views: Int[Tensor, "R"]) -> Float[Tensor, "R 1"]:
+    def compute_vignetting(self, directions: Float[Tensor, "R 3"], views: Int[Tensor, "R"]) -> Float[Tensor, "R 1"]:
         """Factor on the colours of pixels with these directions of the cameras as given: 1 on the axis.
 
         exp(-a r^2 - b r^4), where r is the tangent of the angle to the axis, 1 in the farthest corner.
         """
-        assert self.falloff is not None  # asked for by the caller
-        ahead = (directions * self.axes.index_select(0, views)).sum(1, keepdim=True)
-        tangent_squared = ahead.square().clamp_min(torch.finfo(ahead.dtype).eps).reciprocal() - 1
-        square = tangent_squared / self.corner_tangent_squared
-        first, second = self.falloff
+        assert self.vignetting_coefficients is not None  # asked for by the caller
+        cosine = (directions * self.optical_axes.index_select(0, views)).sum(1, keepdim=True)
+        tan_squared = cosine.square().clamp_min(torch.finfo(cosine.dtype).eps).reciprocal() - 1
+        square = tan_squared / self.corner_tan_squared
+        first, second = self.vignetting_coefficients
         return torch.exp(-square * (first + square * second))

@@ -6,14 +6,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras, resample_path, spiral_like
+from nerf_lightning.cameras import Cameras, make_spiral_path, resample_path
 from nerf_lightning.dataset import Scene, Views
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.path_file import read_path
-from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.files import expand_user_path
 from nerf_lightning.utils.text import subsample
 
-SPLITS = {"test": "val", "train": "train"}
+PHOTO_PATHS = {"test": "val", "train": "train"}
 """Paths through photos, and their attribute of a scene."""
 SPIRAL_FRAMES = 120
 
@@ -55,18 +55,18 @@ def build_path(
     if scene is not None:
         if scale != 1:
             raise InputError("render", "scale", f"{scale:g}", f"1 beside photos (path {path})")
-        photos: Views = getattr(scene, SPLITS[path])
+        photos: Views = getattr(scene, PHOTO_PATHS[path])
         chosen = subsample(len(photos), frames)
         index = torch.tensor(chosen)
         return CameraPath(photos.cameras[index], chosen, photos[index])
     if path == "orbit":
         cameras = resample_path(orbit, frames or len(orbit), closed=True)
     elif path == "spiral":
-        cameras = spiral_like(orbit, frames or SPIRAL_FRAMES)
+        cameras = make_spiral_path(orbit, frames or SPIRAL_FRAMES)
     elif path.endswith(".json"):
-        cameras = read_path(user_path(path), orbit, to_source, path_frame)
+        cameras = read_path(expand_user_path(path), orbit, to_source, path_frame)
         cameras = resample_path(cameras, frames or len(cameras), closed=False)
     else:
-        expected = f"one of orbit, spiral, {', '.join(SPLITS)}, or a .json file"
+        expected = f"one of orbit, spiral, {', '.join(PHOTO_PATHS)}, or a .json file"
         raise InputError("render", "path", repr(path), expected)
-    return CameraPath(cameras if scale == 1 else cameras.scaled(scale), list(range(len(cameras))))
+    return CameraPath(cameras if scale == 1 else cameras.rescale(scale), list(range(len(cameras))))

@@ -7,17 +7,24 @@ from typing import Any
 import numpy as np
 import torch
 
-from nerf_lightning.drawing.frame import CHANNELS, ERROR_TIMES, Style, depth_range, draw, error_picture
-from nerf_lightning.drawing.panels import panel, to_bytes
+from nerf_lightning.drawing.channels import (
+    CHANNELS,
+    ERROR_GAIN,
+    FrameStyle,
+    make_error_image,
+    measure_depth_range,
+    render_channels,
+)
+from nerf_lightning.drawing.panels import make_panel, to_uint8
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.camera_path import CameraPath
 from nerf_lightning.render.video import Image
-from nerf_lightning.renderer import over
+from nerf_lightning.renderer import composite_over
 from nerf_lightning.renderer.background import COLORS
 from nerf_lightning.system import NeRF3D
 
 
-def choose_style(system: NeRF3D, path: CameraPath, channels: str, background: str) -> Style:
+def parse_style(system: NeRF3D, path: CameraPath, channels: str, background: str) -> FrameStyle:
     """How the frames of a path are drawn, from the options `channels` and `background`.
 
     Raises:
@@ -42,11 +49,11 @@ def choose_style(system: NeRF3D, path: CameraPath, channels: str, background: st
         if path.photos.channels == 3 and not np.allclose((red, green, blue), own, atol=1e-3):
             expected = f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in own]}"
             raise InputError("render", "background", background, expected)
-    depths = depth_range(system, path.cameras) if "depth" in names else (0.0, 1.0)
-    return Style(names, None if background == "transparent" else (red, green, blue), depths)
+    depths = measure_depth_range(system, path.cameras) if "depth" in names else (0.0, 1.0)
+    return FrameStyle(names, None if background == "transparent" else (red, green, blue), depths)
 
 
-def describe_frames(path: str, system: NeRF3D, cameras: CameraPath, style: Style) -> dict[str, Any]:
+def build_manifest(path: str, system: NeRF3D, cameras: CameraPath, style: FrameStyle) -> dict[str, Any]:
     """Everything that frames depend on, as plain values."""
     digest = hashlib.sha256()
     for tensor in (*system.state_dict().values(), cameras.cameras.K, cameras.cameras.c2w):
@@ -61,17 +68,17 @@ def describe_frames(path: str, system: NeRF3D, cameras: CameraPath, style: Style
     }
 
 
-def draw_frame(system: NeRF3D, path: CameraPath, style: Style, index: int) -> Image:
+def draw_frame(system: NeRF3D, path: CameraPath, style: FrameStyle, index: int) -> Image:
     """The channels of a view side by side; where there is a photo: photo, render, their difference, and other channels."""
     if path.photos is None:
-        return np.concatenate(list(draw(system, path.cameras, index, style).values()), axis=1)
-    assert style.background is not None  # `choose_style` sees to it
+        return np.concatenate(list(render_channels(system, path.cameras, index, style).values()), axis=1)
+    assert style.background is not None  # `parse_style` sees to it
     pixels = path.photos.image(index)
     background = torch.tensor(style.background).expand(pixels[..., 0].numel(), 3)
-    photo = to_bytes(over(pixels.flatten(0, 1), background).view(*pixels.shape[:2], 3))
+    photo = to_uint8(composite_over(pixels.flatten(0, 1), background).view(*pixels.shape[:2], 3))
     others = [name for name in style.channels if name != "rgb"]
-    drawn = draw(system, path.cameras, index, replace(style, channels=("rgb", *others)))
-    error, psnr = error_picture(drawn["rgb"], photo)
-    names = ["truth", "render", f"{ERROR_TIMES} x error", *others]
+    drawn = render_channels(system, path.cameras, index, replace(style, channels=("rgb", *others)))
+    error, psnr = make_error_image(drawn["rgb"], photo)
+    names = ["truth", "render", f"{ERROR_GAIN} x error", *others]
     caption = f"{' | '.join(names)}    view {path.views[index]}, {psnr:.2f} dB"
-    return panel([photo, drawn["rgb"], error, *(drawn[name] for name in others)], caption)
+    return make_panel([photo, drawn["rgb"], error, *(drawn[name] for name in others)], caption)

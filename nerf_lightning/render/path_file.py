@@ -11,10 +11,10 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras, in_other_frame
-from nerf_lightning.dataset.formats.frames import opengl_to_opencv
+from nerf_lightning.cameras import Cameras, transform_poses
+from nerf_lightning.dataset.formats.transforms_json import opengl_to_opencv
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.scene_file import read_cameras
+from nerf_lightning.runs.scene_file import parse_cameras
 from nerf_lightning.utils.parsing import read_json
 
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
@@ -49,7 +49,7 @@ def read_path(file: Path, orbit: Cameras, to_source: Float[Tensor, "4 4"], frame
             plain = _instant_ngp(plain, *orbit.size(0))
         else:
             kind, own = "a path", "run"
-        cameras = read_cameras(file, "", plain)
+        cameras = parse_cameras(file, "", plain)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
@@ -60,7 +60,7 @@ def read_path(file: Path, orbit: Cameras, to_source: Float[Tensor, "4 4"], frame
     print(f"{file}: {kind} in {where} (--path-frame {'file' if taken == 'run' else 'run'} takes the other)")
     if taken == "run":
         return cameras
-    moved = in_other_frame(cameras.c2w, torch.linalg.inv(to_source.double()))
+    moved = transform_poses(cameras.c2w, torch.linalg.inv(to_source.double()))
     return replace(cameras, c2w=moved.to(cameras.c2w))
 
 

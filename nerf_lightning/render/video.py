@@ -11,20 +11,20 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from nerf_lightning.dataset.formats.decode import image_header
+from nerf_lightning.dataset.formats.image_files import read_image_size
 from nerf_lightning.drawing.panels import write_animation
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import atomic, write_json
-from nerf_lightning.utils.libraries import require
+from nerf_lightning.utils.files import atomic_write, write_json
+from nerf_lightning.utils.libraries import require_extra
 from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.parsing import read_json
-from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.progress import track_progress
 
 Image = UInt8[ndarray, "H W C"]
-PLAN = "frames.json"
+MANIFEST_FILE = "frames.json"
 """Beside the frames: what they show, so that frames of something else are never reused."""
 SUFFIXES = (".gif", ".mp4", ".webp")
-OPAQUE = (".gif", ".mp4")
+OPAQUE_SUFFIXES = (".gif", ".mp4")
 """Formats without partial transparency."""
 CRF = 18
 """Of H.264: smaller is better, 18 looks like the original."""
@@ -35,13 +35,13 @@ def check_output(output: Path, transparent: bool) -> None:
     if output.suffix not in ("", *SUFFIXES):
         expected = f"a name ending in {', '.join(SUFFIXES)}, or a folder of PNGs"
         raise InputError("render", "output", output.name, expected)
-    if transparent and output.suffix in OPAQUE:
+    if transparent and output.suffix in OPAQUE_SUFFIXES:
         raise InputError("render", "background", f"transparent for {output.suffix}", "a colour", "or -o FILE.webp")
     if output.suffix == ".mp4":
-        require("video", "av", purpose="the optional extra that writes .mp4", otherwise=", or -o FILE.webp")
+        require_extra("video", "av", purpose="the optional extra that writes .mp4", hint=", or -o FILE.webp")
 
 
-def write_video(plan: dict[str, Any], draw: Callable[[int], Image], count: int, output: Path, fps: float) -> int:
+def write_video(manifest: dict[str, Any], draw: Callable[[int], Image], count: int, output: Path, fps: float) -> int:
     """Draws all frames that are not there yet, and joins them.
 
     Frames are in the folder itself, or beside a video in a folder of its own until it is written.
@@ -61,36 +61,36 @@ def write_video(plan: dict[str, Any], draw: Callable[[int], Image], count: int, 
     """
     folder = output.with_name(f"{output.name}.frames") if output.suffix else output
     files = [folder / f"{index:05d}.png" for index in range(count)]
-    prepare_folder(folder, plan, owned=bool(output.suffix))
+    prepare_folder(folder, manifest, is_owned=bool(output.suffix))
     missing = [index for index in range(count) if not files[index].exists()]
-    for index in tracked(missing, len(missing), "frames"):
+    for index in track_progress(missing, len(missing), "frames"):
         image = draw(index)
         if index == missing[0]:  # nothing is left of a video of which not even a frame can be drawn
             if output.suffix == ".webp":  # whose writer keeps all frames in memory
                 needed = 4 * count * image[..., 0].size
                 check_memory("render", "frames", f"{count:,} frames", needed, "give less, or -o FILE.mp4")
-            write_json(folder / PLAN, plan)
-        with atomic(files[index]) as temporary:
+            write_json(folder / MANIFEST_FILE, manifest)
+        with atomic_write(files[index]) as temporary:
             imageio.imwrite(temporary, image, compress_level=1)
     if output.suffix:
-        with atomic(output) as temporary:
-            join_frames(files, temporary, fps)
+        with atomic_write(output) as temporary:
+            encode_video(files, temporary, fps)
         shutil.rmtree(folder)
     return count - len(missing)
 
 
-def prepare_folder(folder: Path, plan: dict[str, Any], owned: bool) -> None:
-    """Makes way for the frames of a plan: those of another plan are deleted if the folder is `owned`.
+def prepare_folder(folder: Path, manifest: dict[str, Any], is_owned: bool) -> None:
+    """Makes way for the frames of a plan: those of another plan are deleted if the folder is `is_owned`.
 
     Raises:
         InputError: where it is not, and holds something else.
     """
     try:
-        found = read_json(folder / PLAN, "a plan of frames")
+        found = read_json(folder / MANIFEST_FILE, "a plan of frames")
     except InputError:  # none there, or none whole
         found = None
-    if found != plan and folder.exists():
-        if owned:
+    if found != manifest and folder.exists():
+        if is_owned:
             shutil.rmtree(folder)
         elif any(folder.iterdir()):
             raise InputError(folder, "", "something else in it", "a folder for these frames alone", "give -o FOLDER")
@@ -98,14 +98,14 @@ def prepare_folder(folder: Path, plan: dict[str, Any], owned: bool) -> None:
 
 def read_frames(files: list[Path]) -> Iterator[Image]:
     """Frames on disk, those of smaller photos in the middle of a black or transparent frame of the size of the largest."""
-    sizes = [image_header(file)[:2] for file in files]
+    sizes = [read_image_size(file)[:2] for file in files]
     width, height = (max(sides) for sides in zip(*sizes, strict=True))
     for file, (w, h) in zip(files, sizes, strict=True):
         left, top = (width - w) // 2, (height - h) // 2
         yield np.pad(imageio.imread(file), ((top, height - h - top), (left, width - w - left), (0, 0)))
 
 
-def join_frames(files: list[Path], output: Path, fps: float) -> None:
+def encode_video(files: list[Path], output: Path, fps: float) -> None:
     """Frames on disk -> one video, of the kind that its suffix says.
 
     H.264 has colours at half resolution, which every player knows; odd sizes get one more row or column, never a resize.

@@ -9,7 +9,7 @@ from torch import Generator, Tensor
 from nerf_lightning.errors import InputError
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
-SCENE_CHOICES = ("scene", "random", "suited")
+SCENE_CHOICES = ("scene", "random", "auto")
 
 
 class Background(torch.nn.Module):
@@ -28,7 +28,7 @@ class Background(torch.nn.Module):
 
     def __init__(self, choice: str | list[float], scene_color: tuple[float, float, float], has_alpha: bool):
         super().__init__()
-        self.is_random = choice == "random" or (choice == "suited" and has_alpha)
+        self.is_random = choice == "random" or (choice == "auto" and has_alpha)
         color: Sequence[float]
         if isinstance(choice, str):
             color = scene_color if choice in SCENE_CHOICES else COLORS.get(choice, ())

@@ -4,12 +4,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.kernels.sums import before
+from nerf_lightning.kernels.segment_sums import exclusive_sum
 from nerf_lightning.sampler import Samples
 
-NEAR_POWER = 4
+NEAR_LOSS_POWER = 4
 """Power of the nearness that weight is penalised with: what stands at the box is hardly touched."""
-NEAR_END = 0.7
+NEAR_LOSS_END = 0.7
 """Share of the training in which the near loss fades out: surfaces that it pushed back then find their place."""
 TEXTURELESS_WEIGHT = 10.0
 """What a view residual costs by its size where photos are textureless, in what it costs by its square everywhere."""
@@ -35,9 +35,9 @@ def distortion_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) 
         return weight.sum()
     s = samples.t / (samples.t + scale)
     width = samples.dt * scale / (samples.t + scale) ** 2
-    passed, far = before(torch.stack([weight, weight * s], dim=1), samples.ray, samples.offsets).unbind(1)
-    apart = 2 * weight * (s * passed - far)
-    return (apart + weight**2 * width / 3).sum() / (len(samples.offsets) - 1)
+    passed, far = exclusive_sum(torch.stack([weight, weight * s], dim=1), samples.ray, samples.offsets).unbind(1)
+    pair_distance = 2 * weight * (s * passed - far)
+    return (pair_distance + weight**2 * width / 3).sum() / (len(samples.offsets) - 1)
 
 
 def near_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Float[Tensor, ""]:
@@ -53,7 +53,7 @@ def near_loss(weight: Float[Tensor, "N"], samples: Samples, scale: float) -> Flo
         scale: distance at which n is 0.5, world units.
     """
     nearness = scale / (samples.t + scale)
-    return (weight * nearness**NEAR_POWER).sum() / (len(samples.offsets) - 1)
+    return (weight * nearness**NEAR_LOSS_POWER).sum() / (len(samples.offsets) - 1)
 
 
 def view_loss(

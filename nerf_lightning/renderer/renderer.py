@@ -10,12 +10,12 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Rays
 from nerf_lightning.kernels import composite, volume_weights
-from nerf_lightning.kernels.sums import before
+from nerf_lightning.kernels.segment_sums import exclusive_sum
 from nerf_lightning.model import FieldOutput
 from nerf_lightning.renderer.background import Background
-from nerf_lightning.renderer.losses import AUTO_VIEW_LOSS_WEIGHT, NEAR_END, distortion_loss, near_loss, view_loss
+from nerf_lightning.renderer.losses import AUTO_VIEW_LOSS_WEIGHT, NEAR_LOSS_END, distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
-from nerf_lightning.utils.options import Weight
+from nerf_lightning.utils.option_checks import LossWeight
 
 FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], FieldOutput | tuple[Tensor, Tensor]]
 """World positions and unit directions -> density (1 / world unit) and rgb in [0, 1], see `FieldOutput`."""
@@ -43,7 +43,7 @@ class RenderOutput:
         return self.distance / self.opacity.clamp_min(1e-6)
 
 
-def over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
+def composite_over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
     """Photos' pixels in [0, 1], composited onto backgrounds by their straight alpha where C is 4."""
     colours = (pixels / 255).to(backgrounds.dtype)
     if colours.shape[1] == 3:
@@ -59,14 +59,14 @@ def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], sampl
     """
     if not len(samples):
         return torch.zeros_like(opacity)
-    thickness = density * samples.dt
-    passed = before(thickness, samples.ray, samples.offsets)
+    optical_depth = density * samples.dt
+    passed = exclusive_sum(optical_depth, samples.ray, samples.offsets)
     goal = -torch.log1p(-opacity / 2)
-    short = torch.nn.functional.pad((passed + thickness < goal[samples.ray]).cumsum(0), (1, 0))
+    short = torch.nn.functional.pad((passed + optical_depth < goal[samples.ray]).cumsum(0), (1, 0))
     first, last = samples.offsets[:-1], samples.offsets[1:] - 1
     # A sum that falls short by rounding ends at the last sample; a ray without samples reads any, and is told apart below.
     place = torch.minimum(first + short[samples.offsets[1:]] - short[first], last).clamp_min(0)
-    share = ((goal - passed[place]) / thickness[place].clamp_min(1e-12)).clamp(0, 1)
+    share = ((goal - passed[place]) / optical_depth[place].clamp_min(1e-12)).clamp(0, 1)
     return torch.where(opacity > 0, samples.t[place] + (share - 0.5) * samples.dt[place], 0.0)
 
 
@@ -75,12 +75,12 @@ class VolumeRenderer(torch.nn.Module):
 
     Args:
         background: "scene" (the scene's own), "black", "white", "random" (a new colour for each training ray, the scene's
-            own in evaluation; wants images with alpha), "suited" (random where there is alpha, else the scene's own), or
+            own in evaluation; wants images with alpha), "auto" (random where there is alpha, else the scene's own), or
             three numbers in [0, 1].
         scene_background: the colour "scene" stands for.
         distortion_loss_weight: of `distortion_loss`, against fog.
         near_loss_weight: of `near_loss`, against what stands near the cameras, when training begins; it fades out.
-        view_loss_weight: of `view_loss`, on what the direction adds to colours; "suited" takes `AUTO_VIEW_LOSS_WEIGHT`.
+        view_loss_weight: of `view_loss`, on what the direction adds to colours; "auto" takes `AUTO_VIEW_LOSS_WEIGHT`.
         half_size: of the scene's box, world units.
         unbounded: whether the scene has a background, see `Bounds`.
         alpha: whether the photos have alpha.
@@ -90,9 +90,9 @@ class VolumeRenderer(torch.nn.Module):
         self,
         background: str | list[float] = "scene",
         scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-        distortion_loss_weight: Weight = 0.0,
-        near_loss_weight: Weight = 0.0,
-        view_loss_weight: Weight | Literal["suited"] = 0.0,
+        distortion_loss_weight: LossWeight = 0.0,
+        near_loss_weight: LossWeight = 0.0,
+        view_loss_weight: LossWeight | Literal["auto"] = 0.0,
         half_size: float = 1.0,
         unbounded: bool = False,
         alpha: bool = False,
@@ -108,7 +108,7 @@ class VolumeRenderer(torch.nn.Module):
         self.unbounded = unbounded
 
     @property
-    def uses_texture(self) -> bool:
+    def is_texture_weighted(self) -> bool:
         """Whether `view_loss` asks how textureless photos are: a subject that stands alone is told by its outlines."""
         return self.view_loss_weight > 0 and self.unbounded
 
@@ -120,8 +120,8 @@ class VolumeRenderer(torch.nn.Module):
             backgrounds = self.background.sample(len(rays))
         density, rgb, view_residual = FieldOutput(*field(samples.positions(rays), samples.directions(rays)))
         learns = density.requires_grad
-        if samples.thickness is not None and not learns:
-            density = samples.thickness / samples.dt
+        if samples.optical_depth is not None and not learns:
+            density = samples.optical_depth / samples.dt
         summed, opacity, distance = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
         if self.unbounded and not learns:
             # The mean says little: a hundredth of the weight, left over for the far end, would move it behind the wall.
@@ -155,7 +155,7 @@ class VolumeRenderer(torch.nn.Module):
             losses["distortion"] = self.distortion_loss_weight * distortion_loss(
                 output.weights, samples, self.half_size
             )
-        if near_weight := self.near_loss_weight * max(0.0, 1 - progress / NEAR_END):
+        if near_weight := self.near_loss_weight * max(0.0, 1 - progress / NEAR_LOSS_END):
             losses["near"] = near_weight * near_loss(output.weights, samples, self.half_size)
         if self.view_loss_weight and output.view_residual is not None:
             price = view_loss(output.weights, output.view_residual, samples, texturelessness)

@@ -11,7 +11,7 @@ import torch
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.memory import check_memory
-from nerf_lightning.utils.parsing import DAMAGE_ERRORS, existing_file
+from nerf_lightning.utils.parsing import DAMAGE_ERRORS, require_file
 
 RENDER_KEYS = ("state_dict",)
 RESUME_KEYS = (*RENDER_KEYS, "loops", "callbacks", "optimizer_states", "lr_schedulers", "epoch", "global_step")
@@ -28,7 +28,7 @@ def read_checkpoint(path: Path, keys: Sequence[str] = RENDER_KEYS) -> dict[str, 
         InputError: the file is missing, truncated, changed since it was written, larger than memory, or no state.
     """
     expected = "a whole checkpoint of tensors and plain values"
-    existing_file(path, "a checkpoint", "the run may have ended before its first one")
+    require_file(path, "a checkpoint", "the run may have ended before its first one")
     try:
         with zipfile.ZipFile(path) as archive:
             check_memory(path, "", "a checkpoint", sum(part.file_size for part in archive.infolist()))
@@ -56,5 +56,5 @@ def check_finite(module: torch.nn.Module, where: object) -> None:
     """
     for name, tensor in module.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            todo = "the run has broken down: see its results.json"
-            raise InputError(where, name, "nan or infinity", "weights that are finite numbers", todo)
+            hint = "the run has broken down: see its results.json"
+            raise InputError(where, name, "nan or infinity", "weights that are finite numbers", hint)

@@ -17,16 +17,16 @@ from torch import Tensor
 
 from nerf_lightning.config.build import build_system
 from nerf_lightning.dataset.formats.checks import require_keys
-from nerf_lightning.errors import InputError, found_in
+from nerf_lightning.errors import InputError, attribute_errors_to
 from nerf_lightning.runs.checkpoint import check_finite
-from nerf_lightning.runs.folder import RunFolder, config_from
-from nerf_lightning.runs.scene_file import frame_from
+from nerf_lightning.runs.folder import LoadedRun, parse_config
+from nerf_lightning.runs.scene_file import parse_metadata
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, parse_json, read_content, read_npz
+from nerf_lightning.utils.parsing import VALUE_ERRORS, parse_json, read_file, read_npz, require_file
 
 FORMAT, VERSION = "nerf_lightning compact", 1
-WORTH_BYTES = 2048
+MIN_QUANTIZED_SIZE = 2048
 """Arrays with at least this many numbers are coded as bytes; smaller ones, such as networks, stay half floats."""
 MAX_HEADER_BYTES = 16 << 20
 """Of JSON, which takes up to 32 times as much memory: a thousand cameras are 4 MB. Compressed, zeros are a thousandth."""
@@ -37,26 +37,26 @@ def encode(system: System, precision: str, config: dict[str, Any], scene: dict[s
     """Codes a system as the content of a compact file.
 
     Args:
-        system: trained; see `confined_to` to leave out what no camera sees.
+        system: trained; see `prune_to_cells` to leave out what no camera sees.
         precision: "half" or "byte".
         config, scene: of its run, see `runs.folder`.
     """
     arrays: Arrays = {}
     codes: dict[str, Any] = {}
     learned = dict(system.field.named_parameters())
-    for part, module in system.parts.items():
+    for part, module in system.exportable_modules.items():
         for name, tensor in module.export_state().items():
             code = "bits" if tensor.dtype == torch.bool else "half" if name in learned else "exact"
-            if code == "half" and precision == "byte" and tensor.numel() >= WORTH_BYTES:
+            if code == "half" and precision == "byte" and tensor.numel() >= MIN_QUANTIZED_SIZE:
                 code = "byte"
             whole = f"{part}.{name}"
             codes[whole] = {"code": code, "shape": list(tensor.shape)}
-            arrays |= _coded(whole, tensor.detach().cpu().numpy(), code)
+            arrays |= _quantize(whole, tensor.detach().cpu().numpy(), code)
     header = {"format": FORMAT, "version": VERSION, "config": config, "scene": scene, "arrays": codes}
-    return _packed(header, arrays)
+    return _pack(header, arrays)
 
 
-def _coded(name: str, array: np.ndarray, code: str) -> Arrays:
+def _quantize(name: str, array: np.ndarray, code: str) -> Arrays:
     if code == "bits":
         return {name: np.packbits(array.reshape(-1))}
     if code == "half":
@@ -75,7 +75,7 @@ def _coded(name: str, array: np.ndarray, code: str) -> Arrays:
 
 
 @np.errstate(over="ignore")
-def _decoded(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tensor:
+def _dequantize(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tensor:
     array = arrays[name]
     if code == "bits":
         if math.prod(shape) > 8 * array.size:
@@ -91,7 +91,7 @@ def _decoded(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tensor:
     return torch.from_numpy(array.reshape(shape).copy())
 
 
-def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunFolder:
+def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> LoadedRun:
     """A system, ready to render, from what `encode` gave.
 
     Args:
@@ -102,14 +102,14 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
     Raises:
         InputError: if it is not a compact file, is damaged, of another version, or names something not trusted.
     """
-    header, arrays = _unpacked(content, path)
+    header, arrays = _unpack(content, path)
     try:
-        frame, orbit, to_source = frame_from(header["scene"], f"{path}: header.scene")
-        cfg = config_from(header["config"], path)
-        with found_in(path):
+        frame, orbit, to_source = parse_metadata(header["scene"], f"{path}: header.scene")
+        cfg = parse_config(header["config"], path)
+        with attribute_errors_to(path):
             system = build_system(cfg, frame, device)
-        tensors = {key: _decoded(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
-        for part, module in system.parts.items():
+        tensors = {key: _dequantize(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
+        for part, module in system.exportable_modules.items():
             prefix = f"{part}."
             module.import_state({key[len(prefix) :]: value for key, value in tensors.items() if key.startswith(prefix)})
     except InputError:
@@ -118,10 +118,10 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> RunF
         expected = "the weights of the model it names"
         raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
     check_finite(system, path)
-    return RunFolder(cfg, system.eval().to(device), orbit, to_source, header["scene"])
+    return LoadedRun(cfg, system.eval().to(device), orbit, to_source, header["scene"])
 
 
-def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]:
+def _unpack(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]:
     """The header and the arrays of a compact file.
 
     Raises:
@@ -141,7 +141,7 @@ def _unpacked(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]
     return header, arrays
 
 
-def without_folders(content: bytes) -> bytes:
+def strip_local_paths(content: bytes) -> bytes:
     """The content of a compact file to be given away: of each path on this machine only its last name is left."""
 
     def bare(node: Any) -> Any:
@@ -151,21 +151,21 @@ def without_folders(content: bytes) -> bytes:
             return [bare(value) for value in node]
         return Path(node).name if isinstance(node, str) and Path(node).is_absolute() else node
 
-    header, arrays = _unpacked(content, "compact")
-    return _packed(bare(header), arrays)
+    header, arrays = _unpack(content, "compact")
+    return _pack(bare(header), arrays)
 
 
-def _packed(header: dict[str, Any], arrays: Arrays) -> bytes:
+def _pack(header: dict[str, Any], arrays: Arrays) -> bytes:
     file = io.BytesIO()
     np.savez_compressed(file, **arrays, header=np.frombuffer(json.dumps(header, allow_nan=False).encode(), np.uint8))
     return file.getvalue()
 
 
-def load_compact(path: Path, device: torch.device = CPU) -> RunFolder:
+def load_compact(path: Path, device: torch.device = CPU) -> LoadedRun:
     """Reads a compact file, ready to render on a device.
 
     Raises:
         InputError: as `decode`, and where there is no such file.
     """
-    existing_file(path, "a compact file", "nerf_lightning export compact makes one")
-    return decode(read_content(path), path, device)
+    require_file(path, "a compact file", "nerf_lightning export compact makes one")
+    return decode(read_file(path), path, device)

@@ -5,15 +5,15 @@ import os
 from pathlib import Path
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.files import expand_user_path
 
-OUTPUTS = Path("outputs")
+OUTPUT_ROOT = Path("outputs")
 """Where training puts runs."""
-MARKER = ".nerf_lightning"
+RUN_MARKER = ".nerf_lightning"
 """In a folder that was new or empty when a run was put there, so that all in it is this package's own."""
-CHECKPOINT = Path("checkpoints", "last.ckpt")
+LAST_CHECKPOINT = Path("checkpoints", "last.ckpt")
 """In a run's folder."""
-LATEST = "latest"
+LATEST_LINK = "latest"
 """The link beside the runs of one name to the one that began last."""
 log = logging.getLogger(__name__)
 
@@ -27,8 +27,8 @@ def find_run(path: str | os.PathLike[str] | None = None) -> Path:
     Raises:
         InputError: where there is none.
     """
-    root = OUTPUTS if path is None else user_path(path)
-    if root.name == LATEST and not root.exists():  # where links are not possible
+    root = OUTPUT_ROOT if path is None else expand_user_path(path)
+    if root.name == LATEST_LINK and not root.exists():  # where links are not possible
         root = root.parent
     if root.is_file() or is_run(root):
         return root
@@ -36,21 +36,21 @@ def find_run(path: str | os.PathLike[str] | None = None) -> Path:
     if not runs:
         found = "a folder without a run" if root.is_dir() else "nothing there"
         raise InputError(root, "", found, "a run: a folder with config.yaml and checkpoints/, or a compact file (.npz)")
-    return max(runs, key=lambda run: (run / CHECKPOINT).stat().st_mtime)
+    return max(runs, key=lambda run: (run / LAST_CHECKPOINT).stat().st_mtime)
 
 
 def is_run(folder: Path) -> bool:
     """Whether a folder holds a run that can be opened."""
-    return (folder / "config.yaml").is_file() and (folder / CHECKPOINT).is_file()
+    return (folder / "config.yaml").is_file() and (folder / LAST_CHECKPOINT).is_file()
 
 
 def link_latest(folder: Path) -> None:
     """Points `outputs/NAME/latest` to the run folder `outputs/NAME/TIME`; does nothing for other folders."""
     folder = folder.absolute()
-    if folder.parent.parent.name != OUTPUTS.name or not (folder / MARKER).exists():
+    if folder.parent.parent.name != OUTPUT_ROOT.name or not (folder / RUN_MARKER).exists():
         return
-    link = folder.with_name(LATEST)
-    temporary = link.with_name(f".{LATEST}-{os.getpid()}")
+    link = folder.with_name(LATEST_LINK)
+    temporary = link.with_name(f".{LATEST_LINK}-{os.getpid()}")
     try:
         temporary.symlink_to(folder.name, target_is_directory=True)
         os.replace(temporary, link)

@@ -25,47 +25,47 @@ from torch import Tensor
 import nerf_lightning
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.config import conf_dir
-from nerf_lightning.config.build import build_system, resolved
-from nerf_lightning.config.literal import escape
+from nerf_lightning.config.build import build_system, resolve_config
 from nerf_lightning.config.options import RunOptions
-from nerf_lightning.errors import InputError, found_in
+from nerf_lightning.config.quoting import escape_interpolations
+from nerf_lightning.errors import InputError, attribute_errors_to
 from nerf_lightning.runs.checkpoint import check_finite, read_checkpoint
-from nerf_lightning.runs.scene_file import frame_from, load_scene
+from nerf_lightning.runs.scene_file import parse_metadata, read_scene_file
 from nerf_lightning.system import System
 from nerf_lightning.utils.device import CPU
-from nerf_lightning.utils.files import user_path, write_text
-from nerf_lightning.utils.options import check_options
-from nerf_lightning.utils.parsing import VALUE_ERRORS, existing_file, read_yaml
+from nerf_lightning.utils.files import expand_user_path, write_text
+from nerf_lightning.utils.option_checks import check_options
+from nerf_lightning.utils.parsing import VALUE_ERRORS, read_yaml, require_file
 
-OF_COMMAND = ("overwrite", "version")
+COMMAND_KEYS = ("overwrite", "version")
 """Keys of a configuration that are not those of the run that was made with it."""
 VERSION = ".".join(nerf_lightning.__version__.split(".")[:2])
 """Of this package, as runs are marked with: those of another one are refused."""
-TRUST = "NERF_LIGHTNING_TRUST"
+TRUSTED_PACKAGES_VARIABLE = "NERF_LIGHTNING_TRUSTED_PACKAGES"
 """Environment variable: further packages, comma-separated, whose classes a run folder may name."""
 SWEEP_CALLBACK = "nerf_lightning.training.sweep.SweepReport"
 """Hydra's, never in a run's configuration."""
 
 
 @functools.cache
-def shipped_targets() -> frozenset[str]:
+def list_shipped_targets() -> frozenset[str]:
     """What the shipped configuration builds. Anything else could be called with a stranger's arguments."""
     texts = "".join(file.read_text(encoding="utf-8") for file in conf_dir().rglob("*.yaml"))
     return frozenset(re.findall(r"_target_: ([\w.]+)", texts)) - {SWEEP_CALLBACK}
 
 
-def plain_config(cfg: DictConfig) -> dict[str, Any]:
+def config_to_dict(cfg: DictConfig) -> dict[str, Any]:
     """The resolved configuration; a relative dataset path becomes absolute, so that it is valid from any folder."""
-    plain = {"version": VERSION} | {key: value for key, value in resolved(cfg).items() if key not in OF_COMMAND}
+    plain = {"version": VERSION} | {key: value for key, value in resolve_config(cfg).items() if key not in COMMAND_KEYS}
     path = plain["dataset"].get("path")
     if path is not None:
-        plain["dataset"]["path"] = os.path.abspath(user_path(path))
+        plain["dataset"]["path"] = os.path.abspath(expand_user_path(path))
     return plain
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
     """Writes the resolved configuration."""
-    write_text(folder / "config.yaml", yaml.safe_dump(plain_config(cfg), sort_keys=False))
+    write_text(folder / "config.yaml", yaml.safe_dump(config_to_dict(cfg), sort_keys=False))
 
 
 def load_config(folder: Path) -> DictConfig:
@@ -75,24 +75,24 @@ def load_config(folder: Path) -> DictConfig:
         InputError: if the file is missing, broken or cut short, holds interpolations, or names a target that is not trusted.
     """
     path = folder / "config.yaml"
-    existing_file(path, "the folder of a run", "look below outputs/")
-    return config_from(read_yaml(path, "a run's configuration in YAML"), path)
+    require_file(path, "the folder of a run", "look below outputs/")
+    return parse_config(read_yaml(path, "a run's configuration in YAML"), path)
 
 
-def config_from(plain: Any, path: Path | str) -> DictConfig:
+def parse_config(plain: Any, path: Path | str) -> DictConfig:
     """As `load_config`, of what a file at `path` holds."""
     if not isinstance(plain, dict):
         raise InputError(path, "", type(plain).__name__, "a mapping")
     check_config(path, "", plain)
     if (version := plain.get("version")) != VERSION:
         found = "no version" if version is None else f"version {version}"
-        todo = "train the run again, or use the version of nerf_lightning that made it"
-        raise InputError(path, "version", found, f"version {VERSION}, which this one reads", todo)
+        hint = "train the run again, or use the version of nerf_lightning that made it"
+        raise InputError(path, "version", found, f"version {VERSION}, which this one reads", hint)
     known = {field.name for field in fields(RunOptions)}
     options = {key: value for key, value in plain.items() if key in known}
-    check_options("", RunOptions, options, OF_COMMAND, source=str(path))
+    check_options("", RunOptions, options, COMMAND_KEYS, source=str(path))
     try:
-        return OmegaConf.create(escape(plain))  # text from outside is never an interpolation
+        return OmegaConf.create(escape_interpolations(plain))  # text from outside is never an interpolation
     except RecursionError as error:
         raise InputError(path, "", "values nested too deep", "a run's configuration") from error
 
@@ -103,7 +103,13 @@ def check_config(path: Path | str, key: str, node: Any) -> None:
         for name, value in node.items():
             if name == "_target_" and not _is_trusted(value):
                 expected = "a class of this package that configurations name"
-                raise InputError(path, f"{key}._target_", repr(value), expected, f"set {TRUST} to allow its package")
+                raise InputError(
+                    path,
+                    f"{key}._target_",
+                    repr(value),
+                    expected,
+                    f"set {TRUSTED_PACKAGES_VARIABLE} to allow its package",
+                )
             check_config(path, f"{key}.{name}" if key else str(name), value)
     elif isinstance(node, list):
         for index, value in enumerate(node):
@@ -116,11 +122,11 @@ def check_config(path: Path | str, key: str, node: Any) -> None:
 
 def _is_trusted(target: Any) -> bool:
     """Whether a target is on the list, or defined (not merely imported) in a package that the user trusts."""
-    if str(target) in shipped_targets():
+    if str(target) in list_shipped_targets():
         return True
     module, _, name = str(target).rpartition(".")
     package = module.split(".")[0]
-    if not package or package not in os.environ.get(TRUST, "").split(","):
+    if not package or package not in os.environ.get(TRUSTED_PACKAGES_VARIABLE, "").split(","):
         return False
     try:
         found = getattr(importlib.import_module(module), name, None)
@@ -130,7 +136,7 @@ def _is_trusted(target: Any) -> bool:
 
 
 @dataclass(frozen=True)
-class RunFolder:
+class LoadedRun:
     """A run read back, ready to render."""
 
     cfg: DictConfig
@@ -143,15 +149,15 @@ class RunFolder:
     """The content of scene.json."""
 
 
-def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device = CPU) -> RunFolder:
+def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device = CPU) -> LoadedRun:
     """Rebuilds a trained system from its folder alone, on a device.
 
     Raises:
         InputError: if a file is missing, broken, or does not match the others.
     """
-    cfg, scene = load_config(folder), load_scene(folder)
-    frame, orbit, to_source = frame_from(scene, folder / "scene.json")
-    with found_in(folder / "config.yaml"):
+    cfg, scene = load_config(folder), read_scene_file(folder)
+    frame, orbit, to_source = parse_metadata(scene, folder / "scene.json")
+    with attribute_errors_to(folder / "config.yaml"):
         system = build_system(cfg, frame, device)
     path = folder / "checkpoints" / checkpoint
     state = read_checkpoint(path)
@@ -162,4 +168,4 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device =
     except VALUE_ERRORS as error:
         raise InputError(path, "state_dict", str(error), "the weights of this run's model") from error
     check_finite(system, path)
-    return RunFolder(cfg, system.eval().to(device), orbit, to_source, scene)
+    return LoadedRun(cfg, system.eval().to(device), orbit, to_source, scene)

@@ -9,16 +9,16 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import use_kernels
+from nerf_lightning.kernels import set_kernels
 from nerf_lightning.runs.compact import load_compact
-from nerf_lightning.runs.folder import RunFolder, load_run
+from nerf_lightning.runs.folder import LoadedRun, load_run
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.libraries import silence_lightning
 
 
 @dataclass(frozen=True)
-class SceneRun(RunFolder):
-    """As `RunFolder`, for a scene."""
+class LoadedSceneRun(LoadedRun):
+    """As `LoadedRun`, for a scene."""
 
     system: NeRF3D
     orbit: Cameras
@@ -30,7 +30,7 @@ class SceneRun(RunFolder):
         return float(torch.linalg.det(self.to_source[:3, :3])) ** (1 / 3)
 
 
-def open_run(path: Path, device: torch.device) -> RunFolder:
+def open_run(path: Path, device: torch.device) -> LoadedRun:
     """Reads a trained system, ready to render on a device with the kernels it was trained with.
 
     Raises:
@@ -38,11 +38,11 @@ def open_run(path: Path, device: torch.device) -> RunFolder:
     """
     silence_lightning()
     found = load_compact(path, device) if path.suffix == ".npz" else load_run(path, device=device)
-    use_kernels(found.cfg.kernels)
+    set_kernels(found.cfg.kernels)
     return found
 
 
-def open_scene_run(path: Path, device: torch.device) -> SceneRun:
+def open_scene_run(path: Path, device: torch.device) -> LoadedSceneRun:
     """As `open_run`, of a scene.
 
     Raises:
@@ -51,9 +51,9 @@ def open_scene_run(path: Path, device: torch.device) -> SceneRun:
     found = open_run(path, device)
     if found.orbit is None:
         raise InputError(path, "", "a picture's run", "a scene's run", "final.png shows a picture")
-    return SceneRun(**vars(found))
+    return LoadedSceneRun(**vars(found))
 
 
-def beside(path: Path) -> Path:
+def get_output_folder(path: Path) -> Path:
     """Where to write what is made from a run: its folder, or the one its compact file is in."""
     return path.parent if path.suffix == ".npz" else path

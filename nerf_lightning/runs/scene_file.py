@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras
-from nerf_lightning.config.build import Frame, PictureFrame, SceneFrame, frame_of
+from nerf_lightning.config.build import ImageMetadata, Metadata, SceneMetadata, get_metadata
 from nerf_lightning.dataset import BUILT_IN, DataModule
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.parsing import read_json
 
-WHOLE = "the scene of a run, whole"
+EXPECTED_CONTENT = "the scene of a run, whole"
 
 
 def save_scene(
@@ -25,28 +25,28 @@ def save_scene(
 ) -> None:
     """Writes what rendering needs of the scene, without its photos, and the training cameras if training has corrected them,
     perhaps with a factor on their focal length."""
-    content = scene_content(data)
+    content = scene_to_dict(data)
     if corrected is not None:
         content |= {"corrected": corrected.c2w.tolist(), "focal_factor": focal_factor}
     write_json(folder / "scene.json", content)
 
 
-def scene_content(data: DataModule) -> dict[str, Any]:
+def scene_to_dict(data: DataModule) -> dict[str, Any]:
     """The same as plain values."""
-    scene, frame = data.scene, frame_of(data)
+    scene, frame = data.scene, get_metadata(data)
     content: dict[str, Any] = dict(scene.describe())
     if scene.source != BUILT_IN:
         content["source"] = os.path.abspath(scene.source)
-    if isinstance(frame, SceneFrame):
+    if isinstance(frame, SceneMetadata):
         content |= {
             # Of any photo: `resize=auto` chooses by the budget, device and memory, which differ when the run is opened again.
-            "longest": max(views.cameras.longest for views in (scene.train, scene.val)),
+            "longest": max(views.cameras.max_side for views in (scene.train, scene.val)),
             "background": list(frame.background),
             "aabb": frame.bounds.aabb.tolist(),
             "unbounded": frame.bounds.unbounded,
             "near": frame.bounds.near,
             "far": frame.bounds.far,
-            "pixel": frame.bounds.pixel,
+            "pixel": frame.bounds.pixel_footprint,
             "to_source": scene.to_source.tolist(),
             "orbit": {
                 "K": scene.orbit.K.tolist(),
@@ -58,21 +58,21 @@ def scene_content(data: DataModule) -> dict[str, Any]:
     return content
 
 
-def load_scene(folder: Path) -> dict[str, Any]:
-    """The content of a run's scene.json, whose values `frame_from` checks.
+def read_scene_file(folder: Path) -> dict[str, Any]:
+    """The content of a run's scene.json, whose values `parse_metadata` checks.
 
     Raises:
         InputError: where it is missing or broken.
     """
     path = folder / "scene.json"
-    scene = read_json(path, WHOLE, "")
+    scene = read_json(path, EXPECTED_CONTENT, "")
     if not isinstance(scene, dict):
-        raise InputError(path, "", f"a {type(scene).__name__}", WHOLE)
+        raise InputError(path, "", f"a {type(scene).__name__}", EXPECTED_CONTENT)
     return scene
 
 
-def frame_from(scene: Mapping[str, Any], where: object) -> tuple[Frame, Cameras | None, Tensor | None]:
-    """Reads what `scene_content` gave: a system's frame, the orbit, and the transform to the source; None for a picture.
+def parse_metadata(scene: Mapping[str, Any], where: object) -> tuple[Metadata, Cameras | None, Tensor | None]:
+    """Reads what `scene_to_dict` gave: a system's frame, the orbit, and the transform to the source; None for a picture.
 
     Args:
         scene: read back from a file.
@@ -83,7 +83,7 @@ def frame_from(scene: Mapping[str, Any], where: object) -> tuple[Frame, Cameras 
     """
     try:
         if "aabb" not in scene:
-            return PictureFrame(*checks.check_view_size(where, "resolution", *scene["resolution"])), None, None
+            return ImageMetadata(*checks.check_view_size(where, "resolution", *scene["resolution"])), None, None
         near, far, pixel = (
             None if scene[key] is None else checks.parse_number(where, key, scene[key])
             for key in ("near", "far", "pixel")
@@ -92,13 +92,13 @@ def frame_from(scene: Mapping[str, Any], where: object) -> tuple[Frame, Cameras 
         aabb = torch.from_numpy(checks.check_box(where, "aabb", scene["aabb"])).float()
         red, green, blue = checks.parse_array(where, "background", scene["background"], 3).tolist()
         to_source = checks.check_similarity(where, "to_source", scene["to_source"])
-        frame = SceneFrame(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel), (red, green, blue))
-        return frame, read_cameras(where, "orbit.", scene["orbit"]), torch.from_numpy(to_source)
+        frame = SceneMetadata(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel), (red, green, blue))
+        return frame, parse_cameras(where, "orbit.", scene["orbit"]), torch.from_numpy(to_source)
     except (LookupError, TypeError) as error:
-        raise InputError(where, "", f"{type(error).__name__}: {error}", WHOLE) from error
+        raise InputError(where, "", f"{type(error).__name__}: {error}", EXPECTED_CONTENT) from error
 
 
-def read_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
+def parse_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
     """Cameras from plain values: `width`, `height`, `K` (one or of each view, pixels) and `c2w` (OpenCV frame).
 
     Raises:
@@ -114,4 +114,4 @@ def read_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
     K = np.stack(
         [checks.check_intrinsics(where, f"{key}K", one, width, height) for one in np.broadcast_to(K, (len(c2w), 3, 3))]
     )
-    return Cameras.of_size(torch.from_numpy(K).float(), torch.from_numpy(c2w).float(), width, height)
+    return Cameras.pinhole(torch.from_numpy(K).float(), torch.from_numpy(c2w).float(), width, height)

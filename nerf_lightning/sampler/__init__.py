@@ -2,8 +2,8 @@
 
 from nerf_lightning.sampler.occupancy import OccupancySampler
 from nerf_lightning.sampler.occupancy_grid import OccupancyGrid
-from nerf_lightning.sampler.proposal import ProposalSampler, suited_sampler
-from nerf_lightning.sampler.samples import CHUNK, DensityFn, Sampler, Samples, pack, split
+from nerf_lightning.sampler.proposal import ProposalSampler, choose_sampler
+from nerf_lightning.sampler.samples import CHUNK, DensityFn, Sampler, Samples, pack, split_by_rays
 from nerf_lightning.sampler.uniform import ImportanceSampler, UniformSampler
 
 __all__ = [
@@ -17,6 +17,6 @@ __all__ = [
     "Samples",
     "UniformSampler",
     "pack",
-    "split",
-    "suited_sampler",
+    "split_by_rays",
+    "choose_sampler",
 ]

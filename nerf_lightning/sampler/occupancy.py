@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
-from nerf_lightning.kernels import front_first, keep_visible
+from nerf_lightning.kernels import filter_visible, march_until_opaque
 from nerf_lightning.kernels.march import BLOCK, Packed
 from nerf_lightning.sampler.occupancy_grid import OccupancyGrid
 from nerf_lightning.sampler.samples import CHUNK, DensityFn, Sampler, Samples
-from nerf_lightning.utils.options import Above, AtLeast, Below, Count, Side
+from nerf_lightning.utils.option_checks import Count, Ge, GridSize, Gt, Lt
 
 RESOLUTION = 64
 """Cells along a side for a field of usual size."""
@@ -32,7 +32,7 @@ class SampleCapacity:
     On a CPU, where nothing waits, all are counted; elsewhere once after the cells have changed.
     """
 
-    FACTOR = 1.25  # of the last count
+    HEADROOM = 1.25  # of the last count
     per_ray: tuple[float, float] | None = None
     """Steps in occupied cells, and how many of those were kept, at the last count; None if the next training step counts."""
 
@@ -40,10 +40,10 @@ class SampleCapacity:
         """Room for steps, and for those that are kept; None to count them."""
         if self.per_ray is None:
             return None, None
-        steps, kept = (math.ceil(self.FACTOR * count * num_rays) for count in self.per_ray)
+        steps, kept = (math.ceil(self.HEADROOM * count * num_rays) for count in self.per_ray)
         return steps, kept
 
-    def note(self, rays: Rays, steps: int, kept: int) -> None:
+    def record_counts(self, rays: Rays, steps: int, kept: int) -> None:
         """Takes in a count."""
         if rays.origins.device.type != "cpu":
             self.per_ray = max(steps, 1) / len(rays), max(kept, 1) / len(rays)
@@ -64,8 +64,8 @@ class OccupancySampler(Sampler):
         threshold, decay: see `OccupancyGrid`.
         update_every: training steps between updates.
         warmup: steps during which updates cover every cell; afterwards each covers a quarter of them.
-        memory: updates after which a cell that light no longer reaches is skipped.
-        seen_by: cells seen by fewer training cameras stay empty: what only one camera sees can be anything, such as fog in
+        visibility_window: updates after which a cell that light no longer reaches is skipped.
+        min_cameras: cells seen by fewer training cameras stay empty: what only one camera sees can be anything, such as fog in
             front of its lens.
         early_stop_eps: early-stop transmittance: below it a ray has ended; in pictures at 1/510 at the latest.
         alpha_thre: alpha threshold: training drops steps of lower opacity; at most half the mean, so that fog trains too.
@@ -78,25 +78,25 @@ class OccupancySampler(Sampler):
         self,
         bounds: Bounds,
         samples: Count | None = None,
-        resolution: Side | None = None,
+        resolution: GridSize | None = None,
         threshold: float = 0.01,
         decay: float = 0.8,
         update_every: Count = 16,
         warmup: int = 256,
-        memory: Count = 8,
-        seen_by: int = 3,
-        early_stop_eps: Annotated[float, Above(0), Below(1)] = 1e-4,
-        alpha_thre: Annotated[float, AtLeast(0), Below(1)] = 5e-3,
+        visibility_window: Count = 8,
+        min_cameras: int = 3,
+        early_stop_eps: Annotated[float, Gt(0), Lt(1)] = 1e-4,
+        alpha_thre: Annotated[float, Ge(0), Lt(1)] = 5e-3,
         chunk: int = CHUNK,
     ):
         super().__init__(bounds, chunk)
-        self.grid = OccupancyGrid(bounds, resolution or RESOLUTION, threshold, decay, memory)
-        self.follows_field = resolution is None
-        self.given_samples = samples
+        self.grid = OccupancyGrid(bounds, resolution or RESOLUTION, threshold, decay, visibility_window)
+        self.follows_resolution_scale = resolution is None
+        self.requested_samples = samples
         self.diagonal = 2 * float(self.bounds.half_size.norm())  # a number: reading it from a device would wait
         self.update_every = update_every
         self.warmup = warmup
-        self.seen_by = seen_by
+        self.min_cameras = min_cameras
         self.early_stop_eps = early_stop_eps
         self.alpha_thre = alpha_thre
         self.first_step = 0
@@ -112,17 +112,17 @@ class OccupancySampler(Sampler):
     @property
     def samples(self) -> int:
         """Steps along the diagonal in training."""
-        return self.given_samples or TRAIN_STEPS_PER_CELL * self.grid.resolution
+        return self.requested_samples or TRAIN_STEPS_PER_CELL * self.grid.resolution
 
     @property
     def eval_samples(self) -> int:
         """Steps along the diagonal in pictures."""
-        return self.given_samples or EVAL_STEPS_PER_CELL * self.grid.resolution
+        return self.requested_samples or EVAL_STEPS_PER_CELL * self.grid.resolution
 
     @property
-    def rays_at_once(self) -> int:
+    def ray_chunk_size(self) -> int:
         """On a CPU more than elsewhere: it goes some steps at a time along rays, front first."""
-        return max(1, self.chunk // 2) if self.grid.device.type == "cpu" else super().rays_at_once
+        return max(1, self.chunk // 2) if self.grid.device.type == "cpu" else super().ray_chunk_size
 
     def step_size(self, samples: int) -> float:
         """Length of one of so many steps, world units."""
@@ -130,7 +130,7 @@ class OccupancySampler(Sampler):
 
     def set_resolution_scale(self, scale: float) -> None:
         resolution = BLOCK * round(RESOLUTION / BLOCK * scale)
-        if not self.follows_field or resolution == self.grid.resolution:
+        if not self.follows_resolution_scale or resolution == self.grid.resolution:
             return
         samples = self.samples
         self.grid.resize(resolution)
@@ -145,22 +145,22 @@ class OccupancySampler(Sampler):
                 rays, density, near, far, torch.zeros_like(near), self.grid.occupied, steps, stop
             )
             # A picture must not depend on how its rays are split into calls: only training uses the mean to drop steps.
-            found, packed = keep_visible(found, packed, stop, INVISIBLE_DEPTH, dropped=INVISIBLE_DEPTH)
-            return Samples(*packed, thickness=found)
+            found, packed = filter_visible(found, packed, stop, INVISIBLE_DEPTH, max_dropped=INVISIBLE_DEPTH)
+            return Samples(*packed, optical_depth=found)
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.grid.occupied if self.full_pass else self.grid.active
-        room, kept_room = self.capacity.sizes(len(rays))
-        found, packed = self._march(rays, density, near, far, shift, cells, self.samples, self.early_stop_eps, room)
+        capacity, kept_capacity = self.capacity.sizes(len(rays))
+        found, packed = self._march(rays, density, near, far, shift, cells, self.samples, self.early_stop_eps, capacity)
         if self.min_depth is None:
             self.min_depth = self.grid.mean_active_depth().mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
-        _, kept = keep_visible(found, packed, self.early_stop_eps, self.min_depth, kept_room)
+        _, kept = filter_visible(found, packed, self.early_stop_eps, self.min_depth, kept_capacity)
         positions = Samples(*kept).positions(rays)
         self.grid.mark_visible(positions, self.updates)
-        if room is not None and kept_room is not None:
-            whole = (packed[3][1:] <= room) & (kept[3][1:] <= kept_room)
-            return Samples(*kept, whole, positions)
-        self.capacity.note(rays, len(found), len(kept[0]))
-        return Samples(*kept, places=positions)
+        if capacity is not None and kept_capacity is not None:
+            complete = (packed[3][1:] <= capacity) & (kept[3][1:] <= kept_capacity)
+            return Samples(*kept, complete, positions)
+        self.capacity.record_counts(rays, len(found), len(kept[0]))
+        return Samples(*kept, cached_positions=positions)
 
     @torch.no_grad()
     def _march(
@@ -173,7 +173,7 @@ class OccupancySampler(Sampler):
         cells: Bool[Tensor, "cells"],
         samples: int,
         stop: float,
-        room: int | None = None,
+        capacity: int | None = None,
     ) -> tuple[Float[Tensor, "N"], Packed]:
         """Steps in some cells and the optical depth of each, as far as light reaches."""
 
@@ -181,7 +181,7 @@ class OccupancySampler(Sampler):
             return self._query(density, Samples(*packed).positions(rays)) * packed[1]
 
         given = rays, self.bounds, near, far, shift, cells, samples, self.step_size(samples)
-        return front_first(*given, optical_depth, stop, room, MARCH_CHUNKS * self.chunk)
+        return march_until_opaque(*given, optical_depth, stop, capacity, MARCH_CHUNKS * self.chunk)
 
     def _query(self, density: DensityFn, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """Densities, some positions at a time; mixed precision gives them in half precision."""
@@ -189,7 +189,7 @@ class OccupancySampler(Sampler):
         return found[0].detach() if len(found) == 1 else torch.cat(found)
 
     def mark_invisible_cells(self, cameras: Cameras) -> None:
-        self.grid.mark_invisible_cells(cameras, self.seen_by)
+        self.grid.mark_invisible_cells(cameras, self.min_cameras)
 
     def _load_from_state_dict(self, *given: Any) -> None:
         self.min_depth = None

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, InBounds
+from nerf_lightning.cameras import BoundedModule, Bounds, Cameras
 from nerf_lightning.kernels import mark_cells
 
 MAX_CAMERAS = 128
@@ -31,7 +31,7 @@ def r3_sequence(numbers: Int[Tensor, "N"], generator: Generator) -> Float[Tensor
     return lattice / LATTICE_SIZE
 
 
-class OccupancyGrid(InBounds):
+class OccupancyGrid(BoundedModule):
     """Cells of the bounds with a decaying maximum of the optical depth of a step, found at random positions in each.
 
     Args:

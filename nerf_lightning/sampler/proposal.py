@@ -7,11 +7,11 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import along, resample
+from nerf_lightning.kernels import interval_midpoints, resample
 from nerf_lightning.model.hashgrid import HashGrid, cubic_cells
 from nerf_lightning.sampler.occupancy import OccupancySampler
 from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
-from nerf_lightning.utils.options import Above, AtMost, Below, Count, Entries, Layers, Side
+from nerf_lightning.utils.option_checks import Count, GridSize, Gt, Layers, Le, Log2Size, Lt
 
 INIT_LOG_DENSITY = -1.0
 """Logarithm of the density that proposals begin with, 1 / half-size: thin fog."""
@@ -22,7 +22,7 @@ ANNEAL_SLOPE = 10.0
 class ProposalSampler(Sampler):
     """As many samples on every ray, most of them where a small field expects surfaces.
 
-    A ray is cut into even intervals (see `Bounds.distances`), the small field gives each a weight, and new intervals of equal
+    A ray is cut into even intervals (see `Bounds.s_to_t`), the small field gives each a weight, and new intervals of equal
     weight are cut; after the last cut they go to the large field. Its weights then teach the small one: wherever they are
     larger than proposed, the proposal grows (mip-NeRF 360, Barron et al. 2022, sections 3.1 and 3.2). The small field is a
     grid of logarithms of densities, on several levels that add up.
@@ -30,11 +30,11 @@ class ProposalSampler(Sampler):
     Args:
         bounds: where the content is.
         samples: on each ray, for the large field.
-        first, second: intervals of the cuts before.
+        coarse_samples, fine_samples: intervals of the cuts before.
         anneal: steps until proposals count in full; before, samples are spread more evenly.
-        padding: share of the samples that are spread evenly all the same.
-        levels, coarsest, finest, log2_entries: of the small field, see `HashGridField`.
-        final: what its learning rate has fallen to in the end, besides the schedule. A small field that goes on learning
+        histogram_padding: share of the samples that are spread evenly all the same.
+        num_levels, base_resolution, max_resolution, log2_hashmap_size: of the small field, see `HashGridField`.
+        lr_final_factor: what its learning rate falls to, besides the schedule. A small field that goes on learning
             quickly follows every flicker of the large one, which then has no samples where plain surfaces really are.
         chunk: see `Sampler`.
     """
@@ -45,25 +45,25 @@ class ProposalSampler(Sampler):
         self,
         bounds: Bounds,
         samples: Count = 16,
-        first: Count = 48,
-        second: Count = 24,
+        coarse_samples: Count = 48,
+        fine_samples: Count = 24,
         anneal: int = 500,
-        padding: Annotated[float, Above(0), Below(1)] = 0.01,
-        levels: Layers = 2,
-        coarsest: Side = 32,
-        finest: Side = 128,
-        log2_entries: Entries = 18,
-        final: Annotated[float, Above(0), AtMost(1)] = 0.02,  # at 0 it would learn nothing after the first step
+        histogram_padding: Annotated[float, Gt(0), Lt(1)] = 0.01,
+        num_levels: Layers = 2,
+        base_resolution: GridSize = 32,
+        max_resolution: GridSize = 128,
+        log2_hashmap_size: Log2Size = 18,
+        lr_final_factor: Annotated[float, Gt(0), Le(1)] = 0.02,  # at 0 it would learn nothing after the first step
         chunk: int = CHUNK,
     ):
         super().__init__(bounds, chunk)
         self.samples = samples
-        self.first, self.second = first, second
+        self.coarse_samples, self.fine_samples = coarse_samples, fine_samples
         self.anneal = anneal
-        self.padding = padding
-        self.final = final
-        self.grid = HashGrid(cubic_cells(levels, coarsest, finest), log2_entries, 1)
-        self.unit_length = bounds.longest
+        self.histogram_padding = histogram_padding
+        self.lr_final_factor = lr_final_factor
+        self.grid = HashGrid(cubic_cells(num_levels, base_resolution, max_resolution), log2_hashmap_size, 1)
+        self.unit_length = bounds.max_half_size
         self.first_step = 0
         """The step at which training began."""
         self.step = 0
@@ -72,23 +72,25 @@ class ProposalSampler(Sampler):
         return [{"name": "sampler", "params": list(self.parameters())}]
 
     def lr_factors(self, progress: float) -> dict[str, float]:
-        return {"sampler": self.final**progress}
+        return {"sampler": self.lr_final_factor**progress}
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
         count, device = len(rays), near.device
-        s = torch.linspace(0, 1, self.first + 1, device=device).expand(count, -1)
+        s = torch.linspace(0, 1, self.coarse_samples + 1, device=device).expand(count, -1)
         if generator is not None:
-            s = torch.cat([s[:, :1], s[:, 1:-1] + self._jitter(rays, generator) / self.first, s[:, -1:]], dim=1)
+            s = torch.cat(
+                [s[:, :1], s[:, 1:-1] + self._jitter(rays, generator) / self.coarse_samples, s[:, -1:]], dim=1
+            )
         histograms: list[Histogram] = []
-        for wanted in (self.second, self.samples):
+        for wanted in (self.fine_samples, self.samples):
             with torch.set_grad_enabled(generator is not None):
                 histograms.append(Histogram(s, self.weights(rays, near, far, s)))
-            share = histograms[-1].weights.detach() + self.padding / s.shape[1]
+            share = histograms[-1].weights.detach() + self.histogram_padding / s.shape[1]
             if generator is not None:
                 share = share**self.anneal_exponent
             s = resample(s, share, self._jitter(rays, generator)[:, 0], wanted)
-        _, t, dt = along(rays, self.bounds, near, far, s)
+        _, t, dt = interval_midpoints(rays, self.bounds, near, far, s)
         ray = torch.arange(count, device=device).repeat_interleave(self.samples)
         offsets = torch.arange(count + 1, device=device) * self.samples
         proposals = None if generator is None else Proposals(tuple(histograms), s)
@@ -110,7 +112,7 @@ class ProposalSampler(Sampler):
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]
     ) -> Float[Tensor, "R S"]:
         """How much the small field thinks that each interval contributes to its ray's pixel, see `volume_weights`."""
-        unit, t, dt = along(rays, self.bounds, near, far, s)
+        unit, t, dt = interval_midpoints(rays, self.bounds, near, far, s)
         density = torch.exp(self.grid(unit).sum(1) + INIT_LOG_DENSITY)
         return interval_weights(density.view(t.shape) * (dt / self.unit_length))
 
@@ -149,7 +151,7 @@ def interlevel_loss(
     return ((weights - bound).clamp_min(0) ** 2 / (weights + 1e-5)).sum(1).mean()
 
 
-def suited_sampler(bounds: Bounds, chunk: int = CHUNK) -> Sampler:
+def choose_sampler(bounds: Bounds, chunk: int = CHUNK) -> Sampler:
     """Proposals where every ray meets something, as before a background; where most of the space is empty, an occupancy grid,
     which skips it."""
     return ProposalSampler(bounds, chunk=chunk) if bounds.unbounded else OccupancySampler(bounds, chunk=chunk)

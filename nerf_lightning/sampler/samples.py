@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, InBounds, Rays
-from nerf_lightning.kernels import merge_faint, pack_intervals, points
+from nerf_lightning.cameras import BoundedModule, Bounds, Cameras, Rays
+from nerf_lightning.kernels import merge_low_weight, pack_intervals, ray_positions
 
 DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
 """World positions -> density (1 / world unit); all that samplers know of a field."""
@@ -20,7 +20,7 @@ CHUNK = 1 << 15
 """Default of `Sampler`'s and `System`'s chunk."""
 SAMPLES_PER_RAY = 8
 """That a ray takes about; most rays take few, or many that need little memory."""
-FAINT = 0.01
+MIN_SAMPLE_WEIGHT = 0.01
 """Weight below which a sample of a picture takes its neighbour's colour: a quarter of Lego's at 800 pixels, for 0.001 dB."""
 
 
@@ -28,7 +28,7 @@ class Histogram(NamedTuple):
     """Weights of intervals along rays."""
 
     edges: Float[Tensor, "R S_plus_1"]
-    """In [0, 1], see `Bounds.distances`."""
+    """In [0, 1], see `Bounds.s_to_t`."""
     weights: Float[Tensor, "R S"]
 
 
@@ -53,12 +53,12 @@ class Samples:
     """Index of each sample's ray."""
     offsets: Int[Tensor, "R_plus_1"]
     """Samples of ray r are offsets[r] : offsets[r + 1]."""
-    whole: Bool[Tensor, "R"] | None = None
+    complete: Bool[Tensor, "R"] | None = None
     """Which rays have all their samples, if the number of samples was fixed before they were found: some rays may then lack
     some, or intervals of length 0 fill the end. None: all rays have all."""
-    places: Float[Tensor, "N 3"] | None = None
+    cached_positions: Float[Tensor, "N 3"] | None = None
     """World positions of the midpoints, if already known."""
-    thickness: Float[Tensor, "N"] | None = None
+    optical_depth: Float[Tensor, "N"] | None = None
     """Optical thickness, density times length, if the sampler found it without randomness; it carries no gradient."""
     proposals: Proposals | None = None
     """What the sampler learns from in training, see `Sampler.loss`."""
@@ -68,15 +68,15 @@ class Samples:
 
     def positions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """World positions of the midpoints."""
-        if self.places is not None and not rays.origins.requires_grad:
-            return self.places
-        return points(rays.origins, rays.directions, self.ray, self.t)
+        if self.cached_positions is not None and not rays.origins.requires_grad:
+            return self.cached_positions
+        return ray_positions(rays.origins, rays.directions, self.ray, self.t)
 
     def directions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """Unit viewing direction of each sample."""
         return rays.directions.detach().index_select(0, self.ray)
 
-    def between(self, near: float, far: float) -> "Samples":
+    def clip(self, near: float, far: float) -> "Samples":
         """The samples whose midpoints lie between two distances along their rays."""
         keep = (self.t >= near) & (self.t <= far)
         before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])
@@ -85,21 +85,23 @@ class Samples:
 
     def _take(self, index: Tensor | slice, ray: Int[Tensor, "M"], offsets: Int[Tensor, "Q"]) -> "Samples":
         """Some of the samples of a picture, which belong to these rays."""
-        thickness = None if self.thickness is None else self.thickness[index]
-        return Samples(self.t[index], self.dt[index], ray, offsets, thickness=thickness)
+        optical_depth = None if self.optical_depth is None else self.optical_depth[index]
+        return Samples(self.t[index], self.dt[index], ray, offsets, optical_depth=optical_depth)
 
-    def merged(self) -> "Samples":
-        """For pictures: fewer samples, as one that is `FAINT` needs no colour of its own; the same where thickness is not
+    def merge_low_weight_samples(self) -> "Samples":
+        """For pictures: fewer samples, those below `MIN_SAMPLE_WEIGHT` share a colour; as it is where thickness is not
         known. The t of two that became one is where their weight is."""
-        if self.thickness is None:
+        if self.optical_depth is None:
             return self
-        thickness, packed = merge_faint(self.thickness, (self.t, self.dt, self.ray, self.offsets), FAINT)
-        return Samples(*packed, thickness=thickness)
+        optical_depth, packed = merge_low_weight(
+            self.optical_depth, (self.t, self.dt, self.ray, self.offsets), MIN_SAMPLE_WEIGHT
+        )
+        return Samples(*packed, optical_depth=optical_depth)
 
 
-def interval_weights(thickness: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+def interval_weights(optical_depth: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
     """How much each interval contributes to its ray's pixel, from its density times its length: see `volume_weights`."""
-    return torch.exp(thickness - thickness.cumsum(1)) * -torch.expm1(-thickness)
+    return torch.exp(optical_depth - optical_depth.cumsum(1)) * -torch.expm1(-optical_depth)
 
 
 def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Samples:
@@ -107,8 +109,8 @@ def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Sampl
     return Samples(*pack_intervals(edges, keep))
 
 
-def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:
-    """Splits samples into runs of whole rays with at most `most` samples each (a ray with more is a run of its own).
+def split_by_rays(samples: Samples, max_samples: int) -> Iterator[tuple[slice, Samples]]:
+    """Splits samples into runs of whole rays with at most `max_samples` samples each (a ray with more is a run of its own).
 
     Yields:
         A run's rays as a slice, and their samples with `ray` and `offsets` counted from the run's start.
@@ -116,14 +118,14 @@ def split(samples: Samples, most: int) -> Iterator[tuple[slice, Samples]]:
     offsets = samples.offsets.tolist()
     first, rays = 0, len(offsets) - 1
     while first < rays:
-        last = max(first + 1, bisect.bisect_right(offsets, offsets[first] + most, lo=first) - 1)
+        last = max(first + 1, bisect.bisect_right(offsets, offsets[first] + max_samples, lo=first) - 1)
         part = slice(offsets[first], offsets[last])
         local = samples.offsets[first : last + 1] - offsets[first]
         yield slice(first, last), samples._take(part, samples.ray[part] - first, local)
         first = last
 
 
-class Sampler(InBounds):
+class Sampler(BoundedModule):
     """Base of samplers. Without a generator (evaluation) the samples are not random.
 
     Args:
@@ -139,7 +141,7 @@ class Sampler(InBounds):
         self.chunk = chunk
 
     @property
-    def rays_at_once(self) -> int:
+    def ray_chunk_size(self) -> int:
         """Rays to sample together without gradient."""
         return max(1, self.chunk // SAMPLES_PER_RAY)
 

@@ -5,9 +5,9 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import inverse_cdf
+from nerf_lightning.kernels import invert_cdf
 from nerf_lightning.sampler.samples import CHUNK, DensityFn, Sampler, Samples, interval_weights, pack
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.option_checks import Count
 
 
 def stratified_edges(edges: Float[Tensor, "R S_plus_1"], generator: Generator) -> Float[Tensor, "R S_plus_1"]:
@@ -38,7 +38,7 @@ class UniformSampler(Sampler):
         s = torch.linspace(0, 1, self.samples + 1, device=near.device).expand(len(rays), -1)
         if self.stratified and generator is not None:
             s = stratified_edges(s, generator)
-        return self.bounds.distances(rays, near, far, s)
+        return self.bounds.s_to_t(rays, near, far, s)
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         edges = self.edges(rays, generator)
@@ -54,16 +54,21 @@ class ImportanceSampler(UniformSampler):
     Args:
         bounds: where the content is.
         samples: intervals of the first pass.
-        fine: further samples per ray.
+        importance_samples: further samples per ray.
         stratified: jitter both passes in training.
         chunk: see `Sampler`.
     """
 
     def __init__(
-        self, bounds: Bounds, samples: Count = 64, fine: Count = 64, stratified: bool = True, chunk: int = CHUNK
+        self,
+        bounds: Bounds,
+        samples: Count = 64,
+        importance_samples: Count = 64,
+        stratified: bool = True,
+        chunk: int = CHUNK,
     ):
         super().__init__(bounds, samples, stratified, chunk)
-        self.fine = fine
+        self.importance_samples = importance_samples
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         edges = self.edges(rays, generator)
@@ -73,8 +78,10 @@ class ImportanceSampler(UniformSampler):
             optical = torch.zeros(hit.shape[0], self.samples, device=edges.device)
             optical[hit[:, 0]] = (density(coarse.positions(rays)) * coarse.dt).view(-1, self.samples)
             weights = interval_weights(optical)
-        u = (torch.arange(self.fine, device=edges.device) + 0.5).expand(len(rays), -1) / self.fine
+        u = (torch.arange(self.importance_samples, device=edges.device) + 0.5).expand(
+            len(rays), -1
+        ) / self.importance_samples
         if self.stratified and generator is not None:
-            u = u + (torch.rand(u.shape, generator=generator, device=u.device) - 0.5) / self.fine
-        merged = torch.cat([edges, inverse_cdf(edges, weights, u)], dim=1).sort(dim=1).values
+            u = u + (torch.rand(u.shape, generator=generator, device=u.device) - 0.5) / self.importance_samples
+        merged = torch.cat([edges, invert_cdf(edges, weights, u)], dim=1).sort(dim=1).values
         return pack(merged, hit.expand(-1, merged.shape[1] - 1))

@@ -7,15 +7,15 @@ from typing import Any
 
 from nerf_lightning.config import conf_dir
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import user_path
+from nerf_lightning.utils.files import expand_user_path
 from nerf_lightning.utils.parsing import read_yaml
 
 Options = dict[str, Any]
-GAIN_SHARE = 3.0
-"""A rung is worth its bytes where it gains a `GAIN_SHARE`th of what the choice may be below the best, for twice the bytes."""
-MAX_IDLE = 2
+MIN_GAIN_RATIO = 3.0
+"""A rung pays where it gains a `MIN_GAIN_RATIO`th of what the choice may be below the best, for twice the bytes."""
+MAX_RUNGS_WITHOUT_GAIN = 2
 """Rungs in a row that are not worth their bytes, after which growing stops: one may be chance."""
-FULL_GAIN_DB = 1.0
+FULL_TRAINING_GAIN_DB = 1.0
 """What a full training is assumed to gain over a rung's shorter one: 2 to 15 were measured, in runs of 10 to 140 s."""
 TOLERANCE_DB = 0.5
 """By which an expectation may be wrong."""
@@ -38,7 +38,7 @@ def read_ladder(name: str) -> Ladder:
         InputError: where there is none of that name, or it holds something else.
     """
     known = sorted(file.stem for file in (conf_dir() / "ladders").glob("*.yaml"))
-    path = conf_dir() / "ladders" / f"{name}.yaml" if name in known else user_path(name)
+    path = conf_dir() / "ladders" / f"{name}.yaml" if name in known else expand_user_path(name)
     if not path.is_file():
         raise InputError("rightsize", "ladder", name, f"one of {', '.join(known)}, or a YAML file with `rungs`")
     content = read_yaml(path, "a ladder in YAML")
@@ -59,7 +59,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class Measured:
+class RungResult:
     """A trained rung: how good it is, and how large."""
 
     psnr: float
@@ -71,35 +71,38 @@ class Measured:
     """Of training."""
 
 
-def stop_growing(rungs: Sequence[Measured], target: Target) -> bool:
+def is_growth_finished(rungs: Sequence[RungResult], target: Target) -> bool:
     """Whether there is no point in growing further: the target is near, or the last rungs gained less than they cost."""
     if target.psnr is not None:
-        return rungs[-1].psnr >= target.psnr - FULL_GAIN_DB
-    if len(rungs) <= MAX_IDLE:
+        return rungs[-1].psnr >= target.psnr - FULL_TRAINING_GAIN_DB
+    if len(rungs) <= MAX_RUNGS_WITHOUT_GAIN:
         return False
     # The best before counts, not the last: two rungs that fall and rise again have gained nothing.
-    base = max(rungs[:-MAX_IDLE], key=lambda one: one.psnr)
-    each = target.within_db / GAIN_SHARE
-    return all(one.psnr - base.psnr <= each * max(math.log2(one.size / base.size), 1.0) for one in rungs[-MAX_IDLE:])
+    base = max(rungs[:-MAX_RUNGS_WITHOUT_GAIN], key=lambda one: one.psnr)
+    each = target.within_db / MIN_GAIN_RATIO
+    return all(
+        one.psnr - base.psnr <= each * max(math.log2(one.size / base.size), 1.0)
+        for one in rungs[-MAX_RUNGS_WITHOUT_GAIN:]
+    )
 
 
-def find_best(rungs: Sequence[Measured]) -> int:
+def find_best(rungs: Sequence[RungResult]) -> int:
     """The rung with the highest PSNR, the smallest of equals."""
     return max(range(len(rungs)), key=lambda rung: rungs[rung].psnr)
 
 
-def choose_first(rungs: Sequence[Measured], target: Target) -> int:
+def choose_candidate(rungs: Sequence[RungResult], target: Target) -> int:
     """The rung to train in full first: the smallest that seems good enough, or the best where none does."""
     best = find_best(rungs)
-    enough = rungs[best].psnr - target.within_db if target.psnr is None else target.psnr - FULL_GAIN_DB
+    enough = rungs[best].psnr - target.within_db if target.psnr is None else target.psnr - FULL_TRAINING_GAIN_DB
     return next((rung for rung, one in enumerate(rungs) if one.psnr >= enough), best)
 
 
-def choose_second(first: int, psnr: float, rungs: Sequence[Measured], target: Target, last: int) -> int | None:
+def choose_neighbour(first: int, psnr: float, rungs: Sequence[RungResult], target: Target, last: int) -> int | None:
     """The rung to train in full beside the first, to be sure of the choice; None where that is sure.
 
     Args:
-        first: see `choose_first`.
+        first: see `choose_candidate`.
         psnr: dB that it reaches trained in full.
         rungs: as they were while growing.
         last: the largest rung of the ladder.
@@ -114,7 +117,7 @@ def choose_second(first: int, psnr: float, rungs: Sequence[Measured], target: Ta
     return next(likely, None)
 
 
-def choose_final(full: Mapping[int, Measured], target: Target) -> tuple[int, bool]:
+def choose_final(full: Mapping[int, RungResult], target: Target) -> tuple[int, bool]:
     """The smallest of the rungs trained in full that is good enough, or the best; and whether it is good enough."""
     best = max(full, key=lambda rung: full[rung].psnr)
     enough = full[best].psnr - target.within_db if target.psnr is None else target.psnr

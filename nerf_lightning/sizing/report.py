@@ -8,64 +8,66 @@ from hydra.core.hydra_config import HydraConfig
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
-from nerf_lightning.drawing.ink import BLUE, DPI, GREY, ORANGE, VERMILLION, pixels_of
 from nerf_lightning.drawing.panels import write_png
-from nerf_lightning.runs.folder import plain_config
+from nerf_lightning.drawing.style import BLUE, DPI, GREY, ORANGE, VERMILLION, rasterize_figure
+from nerf_lightning.runs.folder import config_to_dict
 from nerf_lightning.sizing.search import format_figures, set_options
-from nerf_lightning.utils.files import atomic, write_json
+from nerf_lightning.utils.files import atomic_write, write_json
 
-REPORT = "rightsize.json"
+REPORT_FILE = "rightsize.json"
 """Written last: with it the search is done."""
-GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule")
+EXPERIMENT_GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule")
 """Groups whose values best.yaml holds."""
 
 
-def write_report(found: dict[str, Any], cfg: DictConfig, output: Path) -> None:
+def write_report(result: dict[str, Any], cfg: DictConfig, output: Path) -> None:
     """Writes all files, from what `search` found and the configuration before options of a rung."""
-    write_png(output / "chart.png", pixels_of(draw_chart(found)))
-    with atomic(output / "best.yaml") as temporary:
-        temporary.write_text(format_experiment(found, cfg), encoding="utf-8")
-    write_json(output / REPORT, found)
+    write_png(output / "chart.png", rasterize_figure(draw_chart(result)))
+    with atomic_write(output / "best.yaml") as temporary:
+        temporary.write_text(format_experiment(result, cfg), encoding="utf-8")
+    write_json(output / REPORT_FILE, result)
 
 
-def explain(found: dict[str, Any], output: Path) -> str:
+def explain_choice(result: dict[str, Any], output: Path) -> str:
     """What was chosen, why, and where it is."""
-    target, rung = found["target"], str(found["rung"])
-    lines = [f"rung {number} reaches {one['psnr']:.2f} dB trained in full" for number, one in found["full"].items()]
+    target, rung = result["target"], str(result["rung"])
+    lines = [f"rung {number} reaches {one['psnr']:.2f} dB trained in full" for number, one in result["full"].items()]
     if target["psnr"] is None:
         goal = f"{target['within_db']:g} dB below the best are allowed"
     else:
-        goal = f"the target of {target['psnr']:g} dB was {'' if found['reached'] else 'not '}reached"
+        goal = f"the target of {target['psnr']:g} dB was {'' if result['reached'] else 'not '}reached"
     lines[-1] += f"; {goal}: rung {rung}"
-    ratio = found["search_seconds"] / found["full"][rung]["seconds"]
+    ratio = result["search_seconds"] / result["full"][rung]["seconds"]
     lines.append(
-        f"{output}/compact.npz: {format_figures(found['psnr'], found['artifact_bytes'])}; the search took"
-        f" {found['search_seconds']:.0f} s of training, {ratio:.1f} times that of the choice"
+        f"{output}/compact.npz: {format_figures(result['psnr'], result['artifact_bytes'])}; the search took"
+        f" {result['search_seconds']:.0f} s of training, {ratio:.1f} times that of the choice"
     )
-    lines.append(f"again: nerf_lightning train +experiment={output}/best.yaml; all rungs: {output}/chart.png, {REPORT}")
+    lines.append(
+        f"again: nerf_lightning train +experiment={output}/best.yaml; all rungs: {output}/chart.png, {REPORT_FILE}"
+    )
     return "\n".join(lines)
 
 
-def format_experiment(found: dict[str, Any], cfg: DictConfig) -> str:
+def format_experiment(result: dict[str, Any], cfg: DictConfig) -> str:
     """The choice as an experiment in YAML: all that sets it apart from the defaults."""
-    plain = plain_config(set_options(set_options(cfg, "model", found["model"]), "sampler", found["sampler"]))
+    plain = config_to_dict(set_options(set_options(cfg, "model", result["model"]), "sampler", result["sampler"]))
     choices = HydraConfig.get().runtime.choices
-    groups = (*GROUPS, "callbacks", "logger", "trainer")
+    groups = (*EXPERIMENT_GROUPS, "callbacks", "logger", "trainer")
     content: dict[str, Any] = {
         "defaults": [{f"override /{group}": choices.get(group)} for group in groups],
         "name": f"{plain['name']}_rightsized",
         "budget": plain["budget"],
     }
-    for group in GROUPS:
+    for group in EXPERIMENT_GROUPS:
         if plain.get(group) is not None:
             content[group] = {key: value for key, value in plain[group].items() if not key.startswith("_")}
     return f"# @package _global_\n{yaml.safe_dump(content, sort_keys=False)}"
 
 
-def draw_chart(found: dict[str, Any]) -> Figure:
+def draw_chart(result: dict[str, Any]) -> Figure:
     """Bytes against PSNR: the climb, the full trainings, the target, and the choice."""
-    growing, full, chosen = found["growing"], found["full"].values(), found["full"][str(found["rung"])]
-    target = found["target"]
+    growing, full, chosen = result["growing"], result["full"].values(), result["full"][str(result["rung"])]
+    target = result["target"]
     enough = max(one["psnr"] for one in full) - target["within_db"] if target["psnr"] is None else target["psnr"]
     figure = Figure(figsize=(7.2, 4.6), dpi=DPI, layout="constrained")
     axes = figure.subplots()
@@ -78,7 +80,7 @@ def draw_chart(found: dict[str, Any]) -> Figure:
         place = one["size"] / 1000, one["psnr"]
         axes.annotate(str(rung), place, offset, textcoords="offset points", ha="center")
     place = chosen["size"] / 1000, chosen["psnr"]
-    axes.plot(*place, "o", ms=19, mfc="none", mec=VERMILLION, mew=2, label=f"chosen: rung {found['rung']}")
+    axes.plot(*place, "o", ms=19, mfc="none", mec=VERMILLION, mew=2, label=f"chosen: rung {result['rung']}")
     axes.axhline(enough, color=GREY, lw=1, ls="--", label=f"enough: {enough:.2f} dB")
     axes.set(xscale="log", xlabel="compact file, kB", ylabel="held-out PSNR, dB", title="What each size is worth")
     axes.xaxis.set_major_formatter("{x:g}")

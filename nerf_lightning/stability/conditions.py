@@ -10,61 +10,68 @@ import torch
 import yaml
 
 from nerf_lightning.config import conf_dir
-from nerf_lightning.dataset.pixels import Picture
+from nerf_lightning.dataset.pixel_datamodule import Picture
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.synthetic import corruptions
-from nerf_lightning.synthetic.objects import MARBLE, PILE, ROD, make_scene, place_cameras, render_photos
+from nerf_lightning.synthetic.objects import (
+    MARBLE,
+    PILE,
+    ROD,
+    make_hemisphere_cameras,
+    make_object_scene,
+    render_photos,
+)
 from nerf_lightning.synthetic.rooms import ROOMS, make_room_scene
 
-UPSCALE = 2
+UPSCALE_FACTOR = 2
 """Images have this many times the pixels trained on along each side, so that a 2D field is judged between them too."""
 
 
 @cache
-def make_pile(seed: int) -> Scene:
+def make_subject(seed: int) -> Scene:
     """The same for every seed; nobody changes it in place."""
-    return make_scene(PILE)
+    return make_object_scene(PILE)
 
 
 def make_closeup(seed: int) -> Scene:
     """The pile, with held-out views from nearer than the training views."""
-    scene = make_pile(0)
-    cameras = place_cameras(len(scene.val), scene.val.cameras.width, phase=0.7, distance=2.4)
-    return replace(scene, val=Views.of(render_photos(PILE, cameras, scene.background), cameras))
+    scene = make_subject(0)
+    cameras = make_hemisphere_cameras(len(scene.val), scene.val.cameras.width, phase=0.7, distance=2.4)
+    return replace(scene, val=Views.from_images(render_photos(PILE, cameras, scene.background), cameras))
 
 
 def make_waves(width: int = 48, height: int = 48) -> Picture:
     """Waves in three colours that grow shorter from left to right, down to six pixels of the image that is trained on.
 
-    That one is `width` by `height`; this one has `UPSCALE` times as many pixels along each side.
+    That one is `width` by `height`; this one has `UPSCALE_FACTOR` times as many pixels along each side.
     """
-    across, down = ((np.arange(UPSCALE * side) + 0.5) / (UPSCALE * side) for side in (width, height))
+    across, down = ((np.arange(UPSCALE_FACTOR * side) + 0.5) / (UPSCALE_FACTOR * side) for side in (width, height))
     phase = np.pi * across**2 * width / 6
     waves = [np.sin(phase[None, :] + tilt * down[:, None]) for tilt in (0.0, 3.0, 9.0)]
     image = (127.5 + 110 * np.stack(waves, axis=-1)).round().astype(np.uint8)
     return Picture("waves", BUILT_IN, torch.from_numpy(image))
 
 
-def make_plain() -> Picture:
+def make_uniform_image() -> Picture:
     """An image of one colour."""
     return Picture("plain", BUILT_IN, torch.tensor([200, 120, 40], dtype=torch.uint8).expand(96, 96, 3).contiguous())
 
 
 SCENES: dict[str, Callable[[int], Scene | Picture]] = {
-    "pile": make_pile,
-    "pile with alpha": lambda seed: make_scene(PILE, None),
+    "pile": make_subject,
+    "pile with alpha": lambda seed: make_object_scene(PILE, None),
     "pile seen from nearer": make_closeup,
-    "marble on white": lambda seed: make_scene(MARBLE, (1.0, 1.0, 1.0)),
-    "marble on black": lambda seed: make_scene(MARBLE),
-    "rod": lambda seed: make_scene(ROD),
+    "marble on white": lambda seed: make_object_scene(MARBLE, (1.0, 1.0, 1.0)),
+    "marble on black": lambda seed: make_object_scene(MARBLE),
+    "rod": lambda seed: make_object_scene(ROD),
     "small subject": lambda seed: make_room_scene(ROOMS["small subject"], seed),
     "plain floor": lambda seed: make_room_scene(ROOMS["plain floor"], seed),
     "waves": lambda seed: make_waves(),
     "wide waves": lambda seed: make_waves(96, 16),
-    "one colour": lambda seed: make_plain(),
+    "one colour": lambda seed: make_uniform_image(),
 }
-FLAT = ("waves", "wide waves", "one colour")
+IMAGE_SCENES = ("waves", "wide waves", "one colour")
 
 
 @dataclass(frozen=True)
@@ -76,21 +83,21 @@ class Condition:
     corrupt: list[Any] = field(default_factory=list)
     options: list[str] = field(default_factory=list)
     by_kind: dict[str, list[str]] = field(default_factory=dict)
-    rate: float = 1.0
-    hopeless: bool = False
+    lr_scale: float = 1.0
+    is_unsolvable: bool = False
     max_loss_db: float | None = None
     control: bool = False
     quick: bool = False
 
     @property
-    def flat(self) -> bool:
+    def is_2d(self) -> bool:
         """Whether it is 2D."""
-        return self.scene in FLAT
+        return self.scene in IMAGE_SCENES
 
     @property
     def check(self) -> str:
         """What must hold, in words."""
-        if self.hopeless:
+        if self.is_unsolvable:
             return "refused, or an alarm"
         return "no collapse" if self.max_loss_db is None else f"within {self.max_loss_db:g} dB of clean"
 
@@ -109,11 +116,11 @@ class Method:
 
     kind: str
     options: list[str]
-    flat: bool = False
+    is_2d: bool = False
     control: bool = False
-    guarded: str | None = None
+    recovery_twin: str | None = None
 
-    def options_under(self, condition: Condition) -> list[str] | None:
+    def get_options_for(self, condition: Condition) -> list[str] | None:
         """Overrides; None if the condition does not apply."""
         if condition.by_kind and self.kind not in condition.by_kind:
             return None

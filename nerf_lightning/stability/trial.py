@@ -8,22 +8,22 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from nerf_lightning.config.resolvers import slug
-from nerf_lightning.errors import InputError, NoRoom
-from nerf_lightning.stability.conditions import CONDITIONS, METHODS, UPSCALE
-from nerf_lightning.utils.files import full_disk, write_json
+from nerf_lightning.config.resolvers import slugify
+from nerf_lightning.errors import DiskFullError, InputError
+from nerf_lightning.stability.conditions import CONDITIONS, METHODS, UPSCALE_FACTOR
+from nerf_lightning.utils.files import is_disk_full, write_json
 from nerf_lightning.utils.parsing import read_json
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrialResult:
     """The result of a trial, as in stability.json."""
 
     condition: str
     method: str
     seed: int
     psnr: float | None
-    """dB on held-out views; of an image, at `UPSCALE` times the pixels it was trained on along each side."""
+    """dB on held-out views; of an image, at `UPSCALE_FACTOR` times the pixels it was trained on along each side."""
     status: str
     """finished, collapsed, refused (before training) or failed."""
     diagnosis: str
@@ -49,13 +49,13 @@ def list_trials(conditions: Sequence[str], methods: Sequence[str], seeds: int, s
         for condition in CONDITIONS.values()
         if condition.name in conditions
         for name in methods
-        if METHODS[name].flat == condition.flat and METHODS[name].options_under(condition) is not None
+        if METHODS[name].is_2d == condition.is_2d and METHODS[name].get_options_for(condition) is not None
         if not (METHODS[name].control and condition.control)
-        for seed in range(1 if condition.hopeless else seeds)
+        for seed in range(1 if condition.is_unsolvable else seeds)
     ]
 
 
-def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Generator[Outcome, None, None]:
+def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Generator[TrialResult, None, None]:
     """Runs trials in processes of one thread each, which end with this one; yields their outcomes in order.
 
     Raises:
@@ -80,28 +80,28 @@ def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Generator[O
         pool.shutdown(kill_workers=True)
 
 
-def trial_folder(root: Path, condition: str, method: str, seed: int) -> Path:
+def get_trial_folder(root: Path, condition: str, method: str, seed: int) -> Path:
     """Where a trial's run is left."""
-    return root / "trials" / slug(condition) / f"{slug(method)}_seed{seed}"
+    return root / "trials" / slugify(condition) / f"{slugify(method)}_seed{seed}"
 
 
-def run_trial(trial: Trial, root: Path) -> Outcome:
+def run_trial(trial: Trial, root: Path) -> TrialResult:
     """Trains, unless the outcome of a trial with the same options is there."""
     condition, method = CONDITIONS[trial.condition], METHODS[trial.method]
-    folder = trial_folder(root, trial.condition, trial.method, trial.seed)
-    identity = {"steps": trial.steps, "options": method.options_under(condition), "condition": asdict(condition)}
+    folder = get_trial_folder(root, trial.condition, trial.method, trial.seed)
+    identity = {"steps": trial.steps, "options": method.get_options_for(condition), "condition": asdict(condition)}
     try:
         content = read_json(folder / "trial.json", "a trial's outcome")
         if content["identity"] == identity:
-            return Outcome(**content["outcome"])
+            return TrialResult(**content["outcome"])
     except (InputError, KeyError, TypeError):
         pass  # missing or damaged: trained again
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "log.txt").open("w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
         found = train_trial(trial, folder)
-    outcome = Outcome(trial.condition, trial.method, trial.seed, **found)
-    write_json(folder / "trial.json", {"identity": identity, "outcome": asdict(outcome)})
-    return outcome
+    result = TrialResult(trial.condition, trial.method, trial.seed, **found)
+    write_json(folder / "trial.json", {"identity": identity, "outcome": asdict(result)})
+    return result
 
 
 def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
@@ -110,49 +110,53 @@ def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
     Raises:
         OSError, NoRoom: for a full disk, which says nothing about the method.
     """
-    from nerf_lightning.config.compose import composed
-    from nerf_lightning.config.literal import override_of
+    from nerf_lightning.config.compose import compose_config
+    from nerf_lightning.config.quoting import make_override
     from nerf_lightning.dataset import save_npz
     from nerf_lightning.drawing.panels import write_png
     from nerf_lightning.training.train import train
 
     condition, method = CONDITIONS[trial.condition], METHODS[trial.method]
     made: Any = condition.make(trial.seed)
-    if condition.flat:
+    if condition.is_2d:
         path = folder / "image.png"
         write_png(path, made.image.numpy())
-        given = ["callbacks.pictures=null", f"dataset.max_side={max(made.size) // UPSCALE}", f"render.scale={UPSCALE}"]
+        given = [
+            "callbacks.pictures=null",
+            f"dataset.max_side={max(made.size) // UPSCALE_FACTOR}",
+            f"render.scale={UPSCALE_FACTOR}",
+        ]
     else:
         path = folder / "scene.npz"
         save_npz(made, path)
         given = ["dataset=photos", "callbacks.orbit=null"]
     given += [
-        *(method.options_under(condition) or []),
-        override_of("dataset.path", path),
+        *(method.get_options_for(condition) or []),
+        make_override("dataset.path", path),
         f"seed={trial.seed}",
         f"budget.steps={trial.steps}",
     ]
     given += ["threads=1", "device=cpu"]  # trials are small, and run side by side
-    given += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.heldout=null", "callbacks.checkpoints=null"]
+    given += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.validation=null", "callbacks.checkpoints=null"]
     found: dict[str, Any] = {"psnr": None, "status": "failed", "diagnosis": "", "recoveries": 0, "alarm": ""}
     try:
-        cfg = composed(given, folder)
-        cfg.optimizer.lr *= condition.rate
+        cfg = compose_config(given, folder)
+        cfg.optimizer.lr *= condition.lr_scale
         train(cfg)
         results = read_json(folder / "results.json", "figures")
         found |= {key: results[key] for key in ("psnr", "status", "diagnosis")}
-        if method.flat:
+        if method.is_2d:
             between = read_json(folder / "enlarged.json", "figures")["field"]
             found["psnr"] = found["psnr"] if between is None else between  # None where every byte is right
         found["recoveries"] = len(results["recoveries"])
         alarms = [*results["warnings"], found["diagnosis"] if found["status"] == "finished" else ""]
         found["alarm"] = "; ".join(filter(None, alarms))
-    except NoRoom:
+    except DiskFullError:
         raise
     except InputError as error:
         found |= {"status": "refused", "diagnosis": str(error).replace(str(path), condition.name)}
     except Exception as error:  # noqa: BLE001  (failures are what the suite looks for)
-        if full_disk(error):
+        if is_disk_full(error):
             raise
         found["diagnosis"] = " ".join(f"{type(error).__name__}: {error}".split())
     path.unlink(missing_ok=True)

@@ -9,22 +9,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, look_at, orbit_around
+from nerf_lightning.cameras import Bounds, look_at, make_circle_poses
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
-from nerf_lightning.synthetic.objects import make_cameras
-from nerf_lightning.synthetic.solids import bulldozer
+from nerf_lightning.synthetic.objects import make_pinhole_cameras
+from nerf_lightning.synthetic.solids import load_bulldozer
 from nerf_lightning.synthetic.tracer import render_view
-from nerf_lightning.utils.files import atomic, cache_folder
+from nerf_lightning.utils.files import atomic_write, cache_folder
 from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.parsing import read_npz
 
 log = logging.getLogger(__name__)
 
-VERSION = 1
+CACHE_VERSION = 1
 """Part of the cached images' name: raise it whenever model, shading or cameras change."""
-RADIUS = 4.0311
+CAMERA_RADIUS = 4.0311
 """Distance of every camera from the origin, as in the NeRF paper's Lego scene."""
 FIELD_OF_VIEW_RAD = 0.6911112
 """Horizontal; from the same scene."""
@@ -42,15 +42,15 @@ def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_v
     """
     what = f"{train_views + val_views:,} pictures of {size:,}x{size:,} pixels"
     check_memory("bricks", "size, train_views, val_views", what, 4.0 * size**2 * (train_views + val_views))
-    aabb = torch.from_numpy(bulldozer().aabb).float()
+    aabb = torch.from_numpy(load_bulldozer().aabb).float()
     centre = aabb.mean(0)
-    orbit = orbit_around(torch.zeros(3), torch.tensor(UP), RADIUS, math.radians(30), orbit_views)
+    orbit = make_circle_poses(torch.zeros(3), torch.tensor(UP), CAMERA_RADIUS, math.radians(30), orbit_views)
     return Scene(
         name="bricks",
         source=BUILT_IN,
-        train=_render_views(_place_cameras(torch.arange(1, train_views + 1)), size, "train"),
-        val=_render_views(_place_cameras(-torch.arange(1, val_views + 1)), size, "val"),
-        orbit=make_cameras(orbit, size, size, FIELD_OF_VIEW_RAD),
+        train=_render_views(_hemisphere_poses(torch.arange(1, train_views + 1)), size, "train"),
+        val=_render_views(_hemisphere_poses(-torch.arange(1, val_views + 1)), size, "val"),
+        orbit=make_pinhole_cameras(orbit, size, size, FIELD_OF_VIEW_RAD),
         bounds=Bounds(centre + 1.02 * (aabb - centre)),
         background=(0.0, 0.0, 0.0),
     )
@@ -58,22 +58,22 @@ def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_v
 
 def _render_views(c2w: Float[Tensor, "V 4 4"], size: int, split: str) -> Views:
     """Views of the bulldozer, from the cache where an earlier run has traced the same."""
-    cameras = make_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
-    path = cache_folder() / f"bricks-v{VERSION}-{size}px-{len(cameras)}-{split}.npz"
+    cameras = make_pinhole_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
+    path = cache_folder() / f"bricks-v{CACHE_VERSION}-{size}px-{len(cameras)}-{split}.npz"
     with suppress(InputError, KeyError):  # missing, or damaged: traced again
         images = read_npz(path, ["images"])["images"]
         if images.shape == (len(cameras), size, size, 4) and images.dtype == np.uint8:
-            return Views.of(torch.from_numpy(images), cameras)
+            return Views.from_images(torch.from_numpy(images), cameras)
     images = np.stack([render_view(cameras, view) for view in range(len(cameras))])
     try:
-        with atomic(path) as temporary:
+        with atomic_write(path) as temporary:
             np.savez_compressed(temporary, images=images)
     except (OSError, InputError) as error:
         log.warning("the built-in scene is not cached, the next run traces it again: %s", error)
-    return Views.of(torch.from_numpy(images), cameras)
+    return Views.from_images(torch.from_numpy(images), cameras)
 
 
-def _place_cameras(index: Tensor) -> Float[Tensor, "V 4 4"]:
+def _hemisphere_poses(index: Tensor) -> Float[Tensor, "V 4 4"]:
     """Poses on the upper hemisphere, evenly spread whatever their number; no two indices share one.
 
     The R2 sequence: multiples of 1/g^2 and 1/g modulo 1, with g^3 = g + 1, fill the unit square; equal areas of it map
@@ -83,5 +83,5 @@ def _place_cameras(index: Tensor) -> Float[Tensor, "V 4 4"]:
     a, b = ((0.5 + index.double() / g**k) % 1 for k in (2, 1))
     z, azimuth = 0.03 + 0.94 * a, 2 * math.pi * b
     ring = (1 - z**2).sqrt()
-    eye = RADIUS * torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), z], dim=-1)
+    eye = CAMERA_RADIUS * torch.stack([ring * azimuth.cos(), ring * azimuth.sin(), z], dim=-1)
     return look_at(eye, torch.zeros(3).double(), torch.tensor(UP).double()).float()

@@ -13,103 +13,103 @@ from nerf_lightning.dataset.views import Views
 from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.text import subsample
 
-Poses = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
-Photos = Callable[[Float[Tensor, "V H W 3"]], Float[Tensor, "V H W 3"]]
+PoseTransform = Callable[[Float[Tensor, "V 4 4"]], Float[Tensor, "V 4 4"]]
+ColourTransform = Callable[[Float[Tensor, "V H W 3"]], Float[Tensor, "V H W 3"]]
 
 
-def change_poses(views: Views, change: Poses) -> Views:
+def map_poses(views: Views, change: PoseTransform) -> Views:
     """Views with other camera-to-world matrices."""
     return replace(views, cameras=replace(views.cameras, c2w=change(views.cameras.c2w.clone())))
 
 
-def change_colours(views: Views, change: Photos) -> Views:
+def map_colours(views: Views, change: ColourTransform) -> Views:
     """Views with other colours, in [0, 1]; alpha stays."""
     photos = views.images.float() / 255
     photos = torch.cat([change(photos[..., :3]), photos[..., 3:]], dim=-1)
-    return Views.of((photos.clamp(0, 1) * 255).round().to(torch.uint8), views.cameras)
+    return Views.from_images((photos.clamp(0, 1) * 255).round().to(torch.uint8), views.cameras)
 
 
 def flip_axes(scene: Scene, seed: int) -> Scene:
     """OpenGL poses (y up, z backward) read as OpenCV ones."""
     axes = torch.tensor([1.0, -1.0, -1.0, 1.0])
-    train, val = (change_poses(views, lambda c2w: c2w * axes) for views in (scene.train, scene.val))
+    train, val = (map_poses(views, lambda c2w: c2w * axes) for views in (scene.train, scene.val))
     return replace(scene, train=train, val=val)
 
 
 def shuffle_poses(scene: Scene, seed: int) -> Scene:
     """Each training photo has another one's pose."""
-    order = torch.randperm(len(scene.train), generator=step_generator(seed, Stream.STUDY, 0))
-    return replace(scene, train=change_poses(scene.train, lambda c2w: c2w[order]))
+    order = torch.randperm(len(scene.train), generator=step_generator(seed, Stream.ANALYSIS, 0))
+    return replace(scene, train=map_poses(scene.train, lambda c2w: c2w[order]))
 
 
 def swap_poses(scene: Scene, seed: int, count: int) -> Scene:
     """So many training photos, evenly spaced, have the pose of the next of them."""
     wrong, order = subsample(len(scene.train), count), torch.arange(len(scene.train))
     order[wrong] = torch.tensor([*wrong[1:], wrong[0]])
-    return replace(scene, train=change_poses(scene.train, lambda c2w: c2w[order]))
+    return replace(scene, train=map_poses(scene.train, lambda c2w: c2w[order]))
 
 
-def add_pose_noise(scene: Scene, seed: int, degrees: float, shift: float = 0.0) -> Scene:
+def add_pose_noise(scene: Scene, seed: int, degrees: float, shift_std: float = 0.0) -> Scene:
     """Training cameras rotated about random axes and moved.
 
     Args:
         degrees: standard deviation of the angles.
-        shift: standard deviation of the lengths, as a share of the cameras' mean distance to the content's centre.
+        shift_std: standard deviation of the lengths, as a share of the cameras' mean distance to the content's centre.
     """
 
     def shake(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
-        generator = step_generator(seed, Stream.STUDY, 1)
+        generator = step_generator(seed, Stream.ANALYSIS, 1)
         vectors = torch.randn(len(c2w), 3, generator=generator) * (degrees / 180 * torch.pi / 3**0.5)
         cross = torch.zeros(len(c2w), 3, 3)
         cross[:, [2, 0, 1], [1, 2, 0]] = vectors
         c2w[:, :3, :3] = torch.linalg.matrix_exp(cross - cross.mT) @ c2w[:, :3, :3]
         distance = float((c2w[:, :3, 3] - scene.bounds.centre).norm(dim=1).mean())
-        c2w[:, :3, 3] += torch.randn(len(c2w), 3, generator=generator) * (shift * distance / 3**0.5)
+        c2w[:, :3, 3] += torch.randn(len(c2w), 3, generator=generator) * (shift_std * distance / 3**0.5)
         return c2w
 
-    return replace(scene, train=change_poses(scene.train, shake))
+    return replace(scene, train=map_poses(scene.train, shake))
 
 
-def vary_exposure(scene: Scene, seed: int, share: float, tint: float = 0.0) -> Scene:
-    """Training photos brighter or darker by up to `share`, and each of their channels by up to `tint`."""
-    generator, count = step_generator(seed, Stream.STUDY, 2), len(scene.train)
-    gains = 1 + share * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
+def vary_exposure(scene: Scene, seed: int, max_change: float, tint: float = 0.0) -> Scene:
+    """Training photos brighter or darker by up to `max_change`, and each of their channels by up to `tint`."""
+    generator, count = step_generator(seed, Stream.ANALYSIS, 2), len(scene.train)
+    gains = 1 + max_change * (2 * torch.rand(count, 1, 1, 1, generator=generator) - 1)
     gains = gains * (1 + tint * (2 * torch.rand(count, 1, 1, 3, generator=generator) - 1))
-    return replace(scene, train=change_colours(scene.train, lambda rgb: rgb * gains))
+    return replace(scene, train=map_colours(scene.train, lambda rgb: rgb * gains))
 
 
-def add_image_noise(scene: Scene, seed: int, spread: float) -> Scene:
+def add_image_noise(scene: Scene, seed: int, std: float) -> Scene:
     """Noise of that standard deviation on each training pixel."""
-    noise = spread * torch.randn(scene.train.images[..., :3].shape, generator=step_generator(seed, Stream.STUDY, 3))
-    return replace(scene, train=change_colours(scene.train, lambda rgb: rgb + noise))
+    noise = std * torch.randn(scene.train.images[..., :3].shape, generator=step_generator(seed, Stream.ANALYSIS, 3))
+    return replace(scene, train=map_colours(scene.train, lambda rgb: rgb + noise))
 
 
-def add_vignetting(scene: Scene, seed: int, share: float) -> Scene:
+def add_vignetting(scene: Scene, seed: int, falloff: float) -> Scene:
     """All photos, held-out ones too, darker by that share in the corners, elsewhere by the squared distance to the centre."""
 
     def darken(rgb: Float[Tensor, "V H W 3"]) -> Float[Tensor, "V H W 3"]:
         row, column = ((torch.arange(size) + 0.5) / size * 2 - 1 for size in rgb.shape[1:3])
-        return rgb * (1 - share * (row[:, None].square() + column.square())[..., None] / 2)
+        return rgb * (1 - falloff * (row[:, None].square() + column.square())[..., None] / 2)
 
-    return replace(scene, train=change_colours(scene.train, darken), val=change_colours(scene.val, darken))
+    return replace(scene, train=map_colours(scene.train, darken), val=map_colours(scene.val, darken))
 
 
 def scale_focal_length(scene: Scene, seed: int, factor: float) -> Scene:
     """All photos, held-out ones too, said to have that many times their focal length."""
-    train, val = (replace(views, cameras=views.cameras.zoomed(factor)) for views in (scene.train, scene.val))
+    train, val = (replace(views, cameras=views.cameras.zoom(factor)) for views in (scene.train, scene.val))
     return replace(scene, train=train, val=val)
 
 
-def drop_views(scene: Scene, seed: int, count: int) -> Scene:
+def subsample_views(scene: Scene, seed: int, count: int) -> Scene:
     """So many training photos are left, evenly spaced."""
-    return replace(scene, train=scene.train.spread(count))
+    return replace(scene, train=scene.train.subsample(count))
 
 
 def scale_world(scene: Scene, seed: int, factor: float) -> Scene:
     """The same world in another unit."""
     factors = torch.tensor([1.0, 1.0, 1.0, factor]).expand(4, 4).clone()
     factors[3, 3] = 1.0
-    train, val = (change_poses(views, lambda c2w: c2w * factors) for views in (scene.train, scene.val))
+    train, val = (map_poses(views, lambda c2w: c2w * factors) for views in (scene.train, scene.val))
     orbit = replace(scene.orbit, c2w=scene.orbit.c2w * factors)
     return replace(scene, train=train, val=val, orbit=orbit, bounds=Bounds(scene.bounds.aabb * factor))
 
@@ -127,6 +127,6 @@ def scale_bounds(scene: Scene, seed: int, factor: float) -> Scene:
     return replace(scene, bounds=Bounds(scene.bounds.aabb * factor))
 
 
-def misstate_background(scene: Scene, seed: int) -> Scene:
+def set_wrong_background(scene: Scene, seed: int) -> Scene:
     """The same photos, said to stand on white."""
     return replace(scene, background=(1.0, 1.0, 1.0))

@@ -9,11 +9,11 @@ from jaxtyping import Float, Int, UInt8
 
 from nerf_lightning.cameras import Cameras, look_at
 from nerf_lightning.kernels.cpu import solids as fast
-from nerf_lightning.synthetic.solids import Solids, bulldozer
+from nerf_lightning.synthetic.solids import Solids, load_bulldozer
 
 SUPERSAMPLING = 3
 """Samples a pixel along each side."""
-SHADOW_SIZE = 1536
+SHADOW_MAP_SIZE_PX = 1536
 
 
 def rasterize(solids: Solids, cameras: Cameras, view: int) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
@@ -26,14 +26,14 @@ def rasterize(solids: Solids, cameras: Cameras, view: int) -> tuple[Int[np.ndarr
     lift = (solids.to_unit @ c2w[:3, :3] @ np.linalg.inv(K)).astype(np.float32)
     eye = np.einsum("pij,pj->pi", solids.to_unit, c2w[:3, 3] - solids.centre).astype(np.float32)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
-    corners = solids.centre[:, None] + (signs * solids.half[:, None]) @ solids.axes
+    corners = solids.centre[:, None] + (signs * solids.half_size[:, None]) @ solids.axes
     corners = (corners - c2w[:3, 3]) @ c2w[:3, :3] @ K.T
     pixels = corners[..., :2] / corners[..., 2:]
     size = cameras.width, cameras.height
     first, last = np.floor(pixels.min(1) - 0.5).clip(0, size), np.ceil(pixels.max(1) + 0.5).clip(0, size)
     solid = np.full(size[::-1], -1, np.int32)
     depth = np.full(size[::-1], np.inf, np.float32)
-    fast.rasterize(solids.cylinder, lift, eye, first.astype(int), last.astype(int), solid, depth)
+    fast.rasterize(solids.is_cylinder, lift, eye, first.astype(int), last.astype(int), solid, depth)
     return solid, depth
 
 
@@ -47,21 +47,21 @@ class ShadowMap(NamedTuple):
 
 
 @functools.cache
-def map_shadow() -> ShadowMap:
+def render_shadow_map() -> ShadowMap:
     """The bulldozer's shadow map."""
-    light, reach = np.array(fast.LIGHT, float), float(np.linalg.norm(bulldozer().aabb, axis=1).max())
+    light, reach = np.array(fast.LIGHT_POSITION, float), float(np.linalg.norm(load_bulldozer().aabb, axis=1).max())
     c2w = look_at(torch.from_numpy(light).float(), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    focal = SHADOW_SIZE / 2 * float(np.sqrt(light @ light - reach**2)) / reach
-    centre = SHADOW_SIZE / 2
+    focal = SHADOW_MAP_SIZE_PX / 2 * float(np.sqrt(light @ light - reach**2)) / reach
+    centre = SHADOW_MAP_SIZE_PX / 2
     K = torch.tensor([[focal, 0, centre], [0, focal, centre], [0, 0, 1]])
-    cameras = Cameras.of_size(K[None], c2w[None], SHADOW_SIZE, SHADOW_SIZE)
-    return ShadowMap(c2w[:3, :3].numpy(), focal, *rasterize(bulldozer(), cameras, 0))
+    cameras = Cameras.pinhole(K[None], c2w[None], SHADOW_MAP_SIZE_PX, SHADOW_MAP_SIZE_PX)
+    return ShadowMap(c2w[:3, :3].numpy(), focal, *rasterize(load_bulldozer(), cameras, 0))
 
 
 def render_view(cameras: Cameras, view: int) -> UInt8[np.ndarray, "H W 4"]:
     """One view of the bulldozer: sRGB and straight alpha, each pixel the mean of a grid of samples."""
-    fine, solids = cameras.scaled(SUPERSAMPLING), bulldozer()
+    fine, solids = cameras.rescale(SUPERSAMPLING), load_bulldozer()
     rgba = np.zeros((cameras.height, cameras.width, 4), np.uint8)
     K, c2w = fine.K[view].numpy(), fine.c2w[view].numpy()
-    fast.shade(solids.single(), map_shadow(), K, c2w, *rasterize(solids, fine, view), rgba)
+    fast.shade(solids.to_float32(), render_shadow_map(), K, c2w, *rasterize(solids, fine, view), rgba)
     return rgba

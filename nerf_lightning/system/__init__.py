@@ -3,13 +3,18 @@
 from nerf_lightning.system.metrics import mse_to_psnr, psnr, ssim
 from nerf_lightning.system.nerf2d import NeRF2D
 from nerf_lightning.system.nerf3d import NeRF3D
-from nerf_lightning.system.photos import RENDERED_PIXELS, aligned_psnr, misfits, psnr_of_photos
+from nerf_lightning.system.photo_quality import (
+    ALIGN_COST_PIXELS,
+    find_outlier_photos,
+    measure_aligned_psnr,
+    measure_photo_psnr,
+)
 from nerf_lightning.system.schedule import constant, cosine, exponential
 from nerf_lightning.system.state import TrainingClock, TrainingState
 from nerf_lightning.system.system import StepStats, System, ViewResult
 
 __all__ = [
-    "RENDERED_PIXELS",
+    "ALIGN_COST_PIXELS",
     "NeRF2D",
     "NeRF3D",
     "StepStats",
@@ -17,13 +22,13 @@ __all__ = [
     "TrainingClock",
     "TrainingState",
     "ViewResult",
-    "aligned_psnr",
     "constant",
     "cosine",
     "exponential",
-    "misfits",
+    "find_outlier_photos",
+    "measure_aligned_psnr",
+    "measure_photo_psnr",
     "mse_to_psnr",
     "psnr",
-    "psnr_of_photos",
     "ssim",
 ]

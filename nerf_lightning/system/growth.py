@@ -8,14 +8,14 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy
 
 from nerf_lightning.dataset import RayBatch, RayDataModule
-from nerf_lightning.system.system import total_loss
+from nerf_lightning.system.system import sum_losses
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 if TYPE_CHECKING:
     from nerf_lightning.system.nerf3d import NeRF3D
 
 
-def next_stage(system: "NeRF3D", step: int) -> int | None:
+def compute_next_stage(system: "NeRF3D", step: int) -> int | None:
     """The stage that the field is to take at this step; None if it keeps the one it has.
 
     It follows the progress, but for few or many steps (see `ResolutionSchedule.clamp_progress`), and is slower while corrected
@@ -26,48 +26,55 @@ def next_stage(system: "NeRF3D", step: int) -> int | None:
         return None
     if corrections is not None:
         progress = corrections.delay_growth(progress, growth.end)
-    stage = growth.stage_at(growth.clamp_progress(progress, step, may_hurry=corrections is None))
+    stage = growth.stage_at(growth.clamp_progress(progress, step, allow_shortening=corrections is None))
     return stage if stage > system.field.stage else None
 
 
-def follow_resolution(system: "NeRF3D", data: RayDataModule) -> None:
+def sync_resolution_scale(system: "NeRF3D", data: RayDataModule) -> None:
     """Gives the sampler's steps, and the samples a step of the data, the field's present resolution."""
     system.sampler.set_resolution_scale(system.field.resolution_scale)
     data.set_resolution_scale(system.field.resolution_scale)
 
 
 @torch.no_grad()
-def grow_field(system: "NeRF3D", data: RayDataModule, stage: int, optimizer: torch.optim.Optimizer) -> None:
+def upsample_field(system: "NeRF3D", data: RayDataModule, stage: int, optimizer: torch.optim.Optimizer) -> None:
     """Upsamples the field; the optimiser forgets its state for what has another shape."""
     for parameter in system.field.upsample(stage):
         optimizer.state.pop(parameter, None)
-    follow_resolution(system, data)
+    sync_resolution_scale(system, data)
 
 
-class GrowField(L.Callback):
+class FieldGrowth(L.Callback):
     """Upsamples a field that grows when its next stage is due."""
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: "NeRF3D", batch: RayBatch, batch_idx: int) -> None:
-        stage = next_stage(pl_module, trainer.global_step)
+        stage = compute_next_stage(pl_module, trainer.global_step)
         if stage is None:
             return
         if trainer.world_size > 1:  # each process has seen rays of its own, and all must grow alike
             for buffer in pl_module.buffers():
                 torch.distributed.broadcast(buffer, 0)
-        grow_field(pl_module, pl_module.data, stage, trainer.optimizers[0])
+        upsample_field(pl_module, pl_module.datamodule, stage, trainer.optimizers[0])
         if isinstance(trainer.strategy, DDPStrategy):  # it has allocated gradients of the old size
             trainer.strategy.model = pl_module
             trainer.strategy.configure_ddp()
-        if pl_module.backend is not None:
-            rehearse(pl_module, batch)
+        if pl_module.compile_backend is not None:
+            warm_up_compile(pl_module, batch)
 
 
-def rehearse(system: "NeRF3D", batch: RayBatch) -> None:
+def warm_up_compile(system: "NeRF3D", batch: RayBatch) -> None:
     """Runs a step on a copy with the clock stopped: compiling for a new size does not count as training."""
     field, sampler = copy.deepcopy(system.field), copy.deepcopy(system.sampler)
-    options = system.make_optimizer, system.schedule, system.seed, system.chunk, system.corrections, system.backend
-    trial = type(system)(field, sampler, system.renderer, *options)
-    with system.state.clock.paused(), system.trainer.precision_plugin.train_step_context():
+    options = (
+        system.make_optimizer,
+        system.schedule,
+        system.seed,
+        system.chunk,
+        system.corrections,
+        system.compile_backend,
+    )
+    shadow = type(system)(field, sampler, system.renderer, *options)
+    with system.state.clock.pause(), system.trainer.precision_plugin.train_step_context():
         generator = step_generator(system.seed, Stream.STEP, system.global_step, system.device)
-        losses, _ = trial.compute_losses(batch, generator)
-        total_loss(losses).backward()
+        losses, _ = shadow.compute_losses(batch, generator)
+        sum_losses(losses).backward()

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-AT_ONCE = 1 << 18
+PSNR_CHUNK_PIXELS = 1 << 18
 """Pixels compared at once: in doubles, a large picture would take gigabytes."""
 
 
@@ -21,18 +21,18 @@ def psnr(
 ) -> float:
     """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE), of pictures in [0, 1], over all pixels or the known ones; nan where
     none is known."""
-    first, second = (x.reshape(-1, x.shape[-1]).cpu().split(AT_ONCE) for x in (image, truth))
-    masks = [...] * len(first) if known is None else known.reshape(-1).cpu().split(AT_ONCE)
-    squares = count = 0.0
+    first, second = (x.reshape(-1, x.shape[-1]).cpu().split(PSNR_CHUNK_PIXELS) for x in (image, truth))
+    masks = [...] * len(first) if known is None else known.reshape(-1).cpu().split(PSNR_CHUNK_PIXELS)
+    squared_errors = count = 0.0
     for a, b, mask in zip(first, second, masks, strict=True):
         errors = (a[mask].double() - b[mask].double()) ** 2
-        squares, count = squares + float(errors.sum()), count + errors.numel()
-    return mse_to_psnr(squares / count) if count and not math.isnan(squares) else math.nan
+        squared_errors, count = squared_errors + float(errors.sum()), count + errors.numel()
+    return mse_to_psnr(squared_errors / count) if count and not math.isnan(squared_errors) else math.nan
 
 
 SSIM_WINDOW = 11
 """Pixels along a side of the window that torchmetrics uses with its default Gaussian of 1.5 pixels."""
-SSIM_ROWS = 32
+SSIM_CHUNK_ROWS = 32
 """Rows compared at once: the library needs a kilobyte for each pixel."""
 
 
@@ -55,11 +55,11 @@ def ssim(
     if min(height, width, strip or height) < SSIM_WINDOW:
         return math.nan
     first, second = (x.permute(2, 0, 1)[None] for x in (image, truth))
-    margin, together, total = SSIM_WINDOW // 2 if strip is None else 0, strip or SSIM_ROWS, 0.0
+    margin, chunk_rows, total = SSIM_WINDOW // 2 if strip is None else 0, strip or SSIM_CHUNK_ROWS, 0.0
     counted = torch.ones(height, width, dtype=torch.bool) if known is None else known
     second = torch.where(counted, second, first)
-    for start in range(0, height, together):
-        end = min(start + together, height)
+    for start in range(0, height, chunk_rows):
+        end = min(start + chunk_rows, height)
         top, bottom = max(0, start - margin), min(height, end + margin)
         _, scores = structural_similarity_index_measure(
             first[:, :, top:bottom], second[:, :, top:bottom], data_range=1.0, return_full_image=True

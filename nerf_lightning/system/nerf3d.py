@@ -13,16 +13,16 @@ from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
-from nerf_lightning.renderer import RenderOutput, VolumeRenderer, over
-from nerf_lightning.sampler import CHUNK, Sampler, Samples, split
-from nerf_lightning.system.compiled import part
-from nerf_lightning.system.growth import GrowField, follow_resolution
+from nerf_lightning.renderer import RenderOutput, VolumeRenderer, composite_over
+from nerf_lightning.sampler import CHUNK, Sampler, Samples, split_by_rays
+from nerf_lightning.system.correction_trial import CorrectionTrials
+from nerf_lightning.system.growth import FieldGrowth, sync_resolution_scale
 from nerf_lightning.system.state import TrainingState
-from nerf_lightning.system.system import MakeOptimizer, Schedule, StepStats, System, total_loss
-from nerf_lightning.system.trial import TryCorrections
+from nerf_lightning.system.system import OptimizerFactory, Schedule, StepStats, System, sum_losses
+from nerf_lightning.system.torch_compile import maybe_compile
 from nerf_lightning.utils.seeding import Stream, step_generator
 
-SAMPLED_CHUNKS = 16
+SAMPLE_CHUNKS_PER_PASS = 16
 """Samples that are found together without gradient before they are rendered, as multiples of `chunk`."""
 
 
@@ -34,7 +34,7 @@ class NeRF3D(System):
         sampler: rays -> samples.
         renderer: samples -> pixels.
         corrections: of the training photos' cameras and light, learned with the field; None takes them as they are.
-        optimizer, schedule, seed, chunk, backend, state: see `System`.
+        optimizer, schedule, seed, chunk, compile_backend, state: see `System`.
     """
 
     field: Field
@@ -44,15 +44,15 @@ class NeRF3D(System):
         field: Field,
         sampler: Sampler,
         renderer: VolumeRenderer,
-        optimizer: MakeOptimizer,
+        optimizer: OptimizerFactory,
         schedule: Schedule,
         seed: int = 0,
         chunk: int = CHUNK,
         corrections: Corrections | None = None,
-        backend: str | None = None,
+        compile_backend: str | None = None,
         state: TrainingState | None = None,
     ):
-        super().__init__(field, optimizer, schedule, seed, chunk, backend, state)
+        super().__init__(field, optimizer, schedule, seed, chunk, compile_backend, state)
         self.sampler = sampler
         self.renderer = renderer
         self.corrections = corrections
@@ -67,34 +67,34 @@ class NeRF3D(System):
         factors = {name: self.schedule(progress, step) * factor for name, factor in scheduled.items()}
         return factors if self.corrections is None else {**factors, **self.corrections.lr_factors(progress)}
 
-    def warm_start_from(self, smaller: "NeRF3D") -> None:
-        super().warm_start_from(smaller)
-        self.sampler.warm_start_from(smaller.sampler)
+    def warm_start_from(self, source: "NeRF3D") -> None:
+        super().warm_start_from(source)
+        self.sampler.warm_start_from(source.sampler)
         self.sampler.set_resolution_scale(self.field.resolution_scale)
 
     @property
-    def data(self) -> RayDataModule:
+    def datamodule(self) -> RayDataModule:
         """What it trains on."""
         return self.trainer.datamodule  # type: ignore[attr-defined]
 
     def configure_callbacks(self) -> list[L.Callback]:
         """What changes between steps besides the weights: corrections that begin, and the field's resolution."""
-        return [TryCorrections(), GrowField()]
+        return [CorrectionTrials(), FieldGrowth()]
 
     def on_fit_start(self) -> None:
         if self.trainer.ckpt_path is None:  # what is resumed has marked them already
-            self.sampler.mark_invisible_cells(self.data.scene.train.cameras)
-        self.data.measure_texture(self.renderer.uses_texture)
-        follow_resolution(self, self.data)
+            self.sampler.mark_invisible_cells(self.datamodule.scene.train.cameras)
+        self.datamodule.enable_texturelessness(self.renderer.is_texture_weighted)
+        sync_resolution_scale(self, self.datamodule)
 
     def set_first_step(self, step: int) -> None:
         self.sampler.restart(step)
 
     def restart(self, step: int) -> None:
         self.set_first_step(step)
-        self.sampler.mark_invisible_cells(self.data.scene.train.cameras)
-        follow_resolution(self, self.data)
-        self.data.start_again()  # the errors were those of the failed attempt
+        self.sampler.mark_invisible_cells(self.datamodule.scene.train.cameras)
+        sync_resolution_scale(self, self.datamodule)
+        self.datamodule.reset()  # the errors were those of the failed attempt
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         if self.corrections is not None:
@@ -107,11 +107,11 @@ class NeRF3D(System):
     def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
         step = self.global_step
         generator = step_generator(self.seed, Stream.STEP, step, self.device)
-        self.sampler.update(step, part(self.field.density, self.backend), generator)
+        self.sampler.update(step, maybe_compile(self.field.density, self.compile_backend), generator)
         losses, self.stats = self.compute_losses(batch, generator)
         self.update_error_map()
         self.adapt_num_rays()
-        return total_loss(losses)
+        return sum_losses(losses)
 
     def compute_losses(self, batch: RayBatch, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
         """The losses of a step by name, and what it did. All its randomness comes from `generator`."""
@@ -120,18 +120,18 @@ class NeRF3D(System):
             assert batch.views is not None  # training rays are of photos
             rays = self.corrections.poses(rays, batch.views)
         with torch.no_grad():
-            samples = self.sampler(rays.detach(), part(self.field.density, self.backend), generator)
+            samples = self.sampler(rays.detach(), maybe_compile(self.field.density, self.compile_backend), generator)
         backgrounds = self.renderer.background.sample(len(rays), generator)
-        output = part(self.renderer.forward, self.backend)(rays, samples, self.field, backgrounds)
-        truth, rgb = over(batch.pixels, backgrounds), output.rgb
+        output = maybe_compile(self.renderer.forward, self.compile_backend)(rays, samples, self.field, backgrounds)
+        truth, rgb = composite_over(batch.pixels, backgrounds), output.rgb
         if self.corrections is not None:
             assert batch.views is not None
             rgb = self.corrections.color(rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
-        if samples.whole is not None:  # a ray without all of its samples must not be learned from
-            rgb = torch.where(samples.whole[:, None], rgb, truth)
-        squares = (rgb - truth).square().mean(1)
+        if samples.complete is not None:  # a ray without all of its samples must not be learned from
+            rgb = torch.where(samples.complete[:, None], rgb, truth)
+        squared_errors = (rgb - truth).square().mean(1)
         losses = {
-            "photometric": (squares if batch.weights is None else squares * batch.weights).mean(),
+            "photometric": (squared_errors if batch.weights is None else squared_errors * batch.weights).mean(),
             **self.regularize(output, samples, batch),
         }
         stats = StepStats(
@@ -139,8 +139,8 @@ class NeRF3D(System):
             len(rays),
             len(samples),
             output.opacity.detach(),
-            squares.detach(),
-            samples.whole,
+            squared_errors.detach(),
+            samples.complete,
             {name: loss.detach() for name, loss in losses.items()},
         )
         return losses, stats
@@ -155,26 +155,26 @@ class NeRF3D(System):
 
     def adapt_num_rays(self) -> None:
         """Tells the data how many samples the last step took."""
-        if not self.stats.counted:
+        if not self.stats.is_sample_count_exact:
             return
         drawn = self.stats.samples
         if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt in the same way
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))
-        self.data.note_samples(drawn)
+        self.datamodule.adapt_num_rays(drawn)
 
     def update_error_map(self) -> None:
         """Tells the data how wrong each ray of the last step was."""
-        errors, complete = self.stats.squares, self.stats.whole
+        errors, complete = self.stats.squared_errors, self.stats.complete_rays
         assert errors is not None  # a step of this system
-        if self.trainer.world_size > 1 and self.data.focus:  # else nobody asks
+        if self.trainer.world_size > 1 and self.datamodule.error_sampling:  # else nobody asks
             errors, complete = self._gather_errors(errors, complete)
-        self.data.note_errors(errors, complete)
+        self.datamodule.update_error_map(errors, complete)
 
     def _gather_errors(
         self, errors: Float[Tensor, "r"], complete: Bool[Tensor, "r"] | None
     ) -> tuple[Float[Tensor, "R"], Bool[Tensor, "R"]]:
         """Those of all processes, since each draws for all: process p has the rays p, p + world, p + 2 world, ..."""
-        world, rays = self.trainer.world_size, self.data.rays
+        world, rays = self.trainer.world_size, self.datamodule.rays
         both = torch.stack([errors, torch.ones_like(errors) if complete is None else complete.float()])
         padded = torch.nn.functional.pad(both, (0, -(-rays // world) - len(errors)))
         gathered = self.all_gather(padded)
@@ -185,7 +185,7 @@ class NeRF3D(System):
     @property
     def chunk_rays(self) -> int:
         """Rays sampled together without gradient."""
-        return self.sampler.rays_at_once
+        return self.sampler.ray_chunk_size
 
     @torch.no_grad()
     def render(
@@ -198,19 +198,23 @@ class NeRF3D(System):
             near, far: distances along each ray, scene's unit; nothing nearer or farther is seen.
             background: colour in [0, 1]; None takes the renderer's own.
         """
-        behind = self.renderer.background.color if background is None else torch.tensor(background, device=self.device)
+        background_rgb = (
+            self.renderer.background.color if background is None else torch.tensor(background, device=self.device)
+        )
         parts, start, count = [], 0, self.chunk_rays
         while start < len(rays):
             chunk = rays[start : start + count]
             found = self.sampler(chunk, self.field.density)
             # Fog, which an early field is full of, leaves many times more along a ray than a surface does.
-            count = max(1, min(self.chunk_rays, SAMPLED_CHUNKS * self.chunk * len(chunk) // max(1, len(found.t))))
+            count = max(
+                1, min(self.chunk_rays, SAMPLE_CHUNKS_PER_PASS * self.chunk * len(chunk) // max(1, len(found.t)))
+            )
             start += len(chunk)
             if near > 0 or far < math.inf:
-                found = found.between(near, far)
-            for run, samples in split(found.merged(), self.chunk):
+                found = found.clip(near, far)
+            for run, samples in split_by_rays(found.merge_low_weight_samples(), self.chunk):
                 part_rays = chunk[run]
-                parts.append(self.renderer(part_rays, samples, self.field, behind.expand(len(part_rays), 3)))
+                parts.append(self.renderer(part_rays, samples, self.field, background_rgb.expand(len(part_rays), 3)))
         names = ("rgb", "opacity", "distance")
         return RenderOutput(*(torch.cat([getattr(output, name) for output in parts]) for name in names))
 
@@ -218,9 +222,9 @@ class NeRF3D(System):
     def background(self) -> list[float]:
         return [round(c, 3) for c in self.renderer.background.color.tolist()]
 
-    def truth(self, batch: RayBatch) -> Tensor:
-        return over(batch.pixels, self.renderer.background.sample(len(batch.rays)))
+    def compute_target_rgb(self, batch: RayBatch) -> Tensor:
+        return composite_over(batch.pixels, self.renderer.background.sample(len(batch.rays)))
 
-    def show(self, view: ViewBatch) -> tuple[Tensor, Tensor, Tensor]:
+    def render_view(self, view: ViewBatch) -> tuple[Tensor, Tensor, Tensor]:
         rendered = self.render(view.rays)
         return rendered.rgb, rendered.depth, rendered.opacity

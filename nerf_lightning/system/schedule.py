@@ -2,31 +2,39 @@
 
 import math
 
-from nerf_lightning.utils.options import Count
+from nerf_lightning.utils.option_checks import Count
 
 
-def _start(progress: float, step: int, warmup: float, inverse_root: Count | None) -> float:
+def _warmup_factor(progress: float, step: int, warmup: float, inverse_sqrt_after: Count | None) -> float:
     """The factor that all have in common: a linear warm-up, and 1 / sqrt(1 + step / inverse_root)."""
-    warm = min(1.0, (progress + 1e-3) / (warmup + 1e-3))
-    return warm if inverse_root is None else warm / math.sqrt(1 + step / inverse_root)
+    factor = min(1.0, (progress + 1e-3) / (warmup + 1e-3))
+    return factor if inverse_sqrt_after is None else factor / math.sqrt(1 + step / inverse_sqrt_after)
 
 
-def constant(progress: float, step: int = 0, warmup: float = 0.0, inverse_root: Count | None = None) -> float:
+def constant(progress: float, step: int = 0, warmup: float = 0.0, inverse_sqrt_after: Count | None = None) -> float:
     """1 after a linear warm-up over the first `warmup` of the budget; besides, as one over the root of steps, if many of these
-    are to be taken: from `inverse_root` steps on. A long training at the rate of a short one loses what it has."""
-    return _start(progress, step, warmup, inverse_root)
+    are to be taken: from `inverse_sqrt_after` steps on. A long training at the rate of a short one loses what it has."""
+    return _warmup_factor(progress, step, warmup, inverse_sqrt_after)
 
 
 def exponential(
-    progress: float, step: int = 0, warmup: float = 0.01, final: float = 0.1, inverse_root: Count | None = None
+    progress: float,
+    step: int = 0,
+    warmup: float = 0.01,
+    final_factor: float = 0.1,
+    inverse_sqrt_after: Count | None = None,
 ) -> float:
-    """As `constant`, times final^progress: from 1 down to `final` at the end."""
-    return _start(progress, step, warmup, inverse_root) * final**progress
+    """As `constant`, times final_factor^progress: from 1 down to `final_factor` at the end."""
+    return _warmup_factor(progress, step, warmup, inverse_sqrt_after) * final_factor**progress
 
 
 def cosine(
-    progress: float, step: int = 0, warmup: float = 0.01, final: float = 0.0, inverse_root: Count | None = None
+    progress: float,
+    step: int = 0,
+    warmup: float = 0.01,
+    final_factor: float = 0.0,
+    inverse_sqrt_after: Count | None = None,
 ) -> float:
-    """As `constant`, times half a cosine from 1 down to `final` at the end."""
-    fallen = final + (1 - final) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
-    return _start(progress, step, warmup, inverse_root) * fallen
+    """As `constant`, times half a cosine from 1 down to `final_factor` at the end."""
+    factor = final_factor + (1 - final_factor) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
+    return _warmup_factor(progress, step, warmup, inverse_sqrt_after) * factor

@@ -12,18 +12,18 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.dataset.loader import StepDataModule
-from nerf_lightning.dataset.subset import WHOLE, PixelSubset
+from nerf_lightning.dataset.datamodule import StepDataModule
+from nerf_lightning.dataset.pixel_subset import ALL_PIXELS, PixelSubset
 from nerf_lightning.model import Field, PictureField
 from nerf_lightning.refine import Corrections
 from nerf_lightning.sampler import CHUNK
 from nerf_lightning.system.metrics import psnr, ssim
 from nerf_lightning.system.state import TrainingState
 from nerf_lightning.utils.device import synchronize
-from nerf_lightning.utils.memory import give_back_freed_memory
+from nerf_lightning.utils.memory import release_freed_memory
 from nerf_lightning.utils.seeding import Stream, step_generator
 
-MakeOptimizer = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
+OptimizerFactory = Callable[[list[dict[str, Any]]], torch.optim.Optimizer]
 Schedule = Callable[[float, int], float]
 """Progress in [0, 1] and step -> factor on the learning rate."""
 
@@ -39,17 +39,17 @@ class StepStats:
     samples: int
     opacity: Float[Tensor, "R"] | None = None
     """Of each ray, on the device: 0 is empty, 1 is opaque."""
-    squares: Float[Tensor, "R"] | None = None
+    squared_errors: Float[Tensor, "R"] | None = None
     """Squared error of each ray, on the device."""
-    whole: Bool[Tensor, "R"] | None = None
+    complete_rays: Bool[Tensor, "R"] | None = None
     """Which rays have all their samples; None for all."""
     losses: Mapping[str, Tensor] = field(default_factory=dict)
     """What the loss is the sum of, by name, on the device."""
 
     @property
-    def counted(self) -> bool:
+    def is_sample_count_exact(self) -> bool:
         """Whether `samples` is their count; otherwise it is the room for them."""
-        return self.whole is None
+        return self.complete_rays is None
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class ViewResult:
     """See `PixelSubset.strip`."""
 
     @property
-    def pixels(self) -> int:
+    def num_pixels(self) -> int:
         """How many were rendered."""
         return self.rgb.shape[:2].numel()
 
@@ -79,17 +79,17 @@ class ViewResult:
         return ssim(self.rgb, self.truth, self.known, self.strip)
 
     @property
-    def comparable(self) -> Float[Tensor, "H W 3"]:
+    def masked_truth(self) -> Float[Tensor, "H W 3"]:
         """The truth; the render itself where the truth is not known."""
         return self.truth if self.known is None else torch.where(self.known[..., None], self.truth, self.rgb)
 
     @property
     def errors(self) -> Float[Tensor, "H W 3"]:
         """Absolute differences; 0 where the truth is not known."""
-        return (self.rgb - self.comparable).abs()
+        return (self.rgb - self.masked_truth).abs()
 
 
-def total_loss(losses: Mapping[str, Tensor]) -> Float[Tensor, ""]:
+def sum_losses(losses: Mapping[str, Tensor]) -> Float[Tensor, ""]:
     """What a step minimises: the sum of its losses."""
     first, *others = losses.values()
     return sum(others, first)
@@ -104,18 +104,18 @@ class System(L.LightningModule):
         schedule: factor on its learning rate by progress and step.
         seed: of all randomness in training steps.
         chunk: samples rendered at once without gradient: bounds the memory that a view of any size takes.
-        backend: compiler of the parts of a training step, see `compiled.part`; None does not compile.
+        compile_backend: compiler of the parts of a training step, see `torch_compile.maybe_compile`; None does not compile.
         state: of the training, shared with the callbacks that steer it; None makes one.
     """
 
     def __init__(
         self,
         field: Field | PictureField,
-        optimizer: MakeOptimizer,
+        optimizer: OptimizerFactory,
         schedule: Schedule,
         seed: int = 0,
         chunk: int = CHUNK,
-        backend: str | None = None,
+        compile_backend: str | None = None,
         state: TrainingState | None = None,
     ):
         super().__init__()
@@ -124,19 +124,19 @@ class System(L.LightningModule):
         self.schedule = schedule
         self.seed = seed
         self.chunk = chunk
-        self.backend = backend
+        self.compile_backend = compile_backend
         self.state = state or TrainingState()
         self.corrections: Corrections | None = None
         """Of the training photos' cameras and light."""
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
-    def warm_start_from(self, smaller: "System") -> None:
+    def warm_start_from(self, source: "System") -> None:
         """Continues from what a system with a smaller field of the same kind has learned."""
         field: Any = self.field
-        field.warm_start_from(smaller.field)
+        field.warm_start_from(source.field)
 
     @property
-    def parts(self) -> dict[str, Any]:
+    def exportable_modules(self) -> dict[str, Any]:
         """What a compact file keeps, by name: modules with `export_state` and `import_state`."""
         return {name: module for name, module in self.named_children() if hasattr(module, "export_state")}
 
@@ -149,10 +149,10 @@ class System(L.LightningModule):
         """The losses of a step by name, and what it did. All its randomness comes from `generator`."""
         raise TypeError(f"{type(self).__name__} must define compute_losses(batch, generator)")
 
-    def rehearse(self, batch: Any) -> None:
+    def warm_up_kernels(self, batch: Any) -> None:
         """Computes the gradients of a step, so that kernels are compiled."""
         losses, _ = self.compute_losses(batch.to(self.device), step_generator(0, Stream.STEP, 0, self.device))
-        total_loss(losses).backward()
+        sum_losses(losses).backward()
 
     def param_groups(self) -> list[dict[str, Any]]:
         """The optimiser's groups of parameters, each with a name; without `lr`, one takes the optimiser's own."""
@@ -176,7 +176,7 @@ class System(L.LightningModule):
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.trainer.max_steps > 0:
-            self.state.advance(max(self.state.progress, self.global_step / self.trainer.max_steps))
+            self.state.set_progress(max(self.state.progress, self.global_step / self.trainer.max_steps))
         self.set_learning_rates(self.trainer.optimizers[0], self.global_step)
 
     def set_first_step(self, step: int) -> None:
@@ -185,20 +185,22 @@ class System(L.LightningModule):
     def restart(self, step: int) -> None:
         """Called when training starts again at a step, with a fresh field."""
 
-    def truth(self, batch: Any) -> Float[Tensor, "N 3"]:
+    def compute_target_rgb(self, batch: Any) -> Float[Tensor, "N 3"]:
         """The colours that a batch should have in evaluation."""
-        raise TypeError(f"{type(self).__name__} must define truth(batch)")
+        raise TypeError(f"{type(self).__name__} must define compute_target_rgb(batch)")
 
-    def show(self, view: Any) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"] | None, Float[Tensor, "N"] | None]:
+    def render_view(
+        self, view: Any
+    ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"] | None, Float[Tensor, "N"] | None]:
         """The field's colours of a whole view, with depth and opacity if it has them."""
-        raise TypeError(f"{type(self).__name__} must define show(view)")
+        raise TypeError(f"{type(self).__name__} must define render_view(view)")
 
     @property
     def background(self) -> list[float] | None:
         """The background of evaluated views; None for a picture."""
         return None
 
-    def between(self, view: Any) -> float | None:
+    def measure_off_grid_psnr(self, view: Any) -> float | None:
         """PSNR of a picture's field between its pixels; None where there is none to measure."""
         return None
 
@@ -212,38 +214,38 @@ class System(L.LightningModule):
         view = view.to(self.device)
         synchronize(self.device)
         start = time.perf_counter()
-        rgb, depth, opacity = self.show(view)
+        rgb, depth, opacity = self.render_view(view)
         synchronize(self.device)
         seconds = time.perf_counter() - start
 
         def image(x: Tensor) -> Tensor:
             return x.view(view.height, view.width, *x.shape[1:]).cpu()
 
-        rgb, truth = image(rgb.clamp_(0, 1)), image(self.truth(view))
-        depth, opacity, known = (None if x is None else image(x) for x in (depth, opacity, view.known))
+        rgb, truth = image(rgb.clamp_(0, 1)), image(self.compute_target_rgb(view))
+        depth, opacity, known = (None if x is None else image(x) for x in (depth, opacity, view.valid_mask))
         return ViewResult(rgb, truth, psnr(rgb, truth, known), seconds, depth, opacity, known, view.strip)
 
     def evaluate_views(self, views: Iterable[Any]) -> Iterator[ViewResult]:
         """Evaluates views one after the other, in memory that training has given back."""
         self.zero_grad()  # which the next step does in any case
-        give_back_freed_memory()
+        release_freed_memory()
         try:
             yield from map(self.evaluate, views)
         finally:
-            give_back_freed_memory()
+            release_freed_memory()
 
     def evaluate_held_out(
-        self, data: StepDataModule, views: Iterable[int], subset: PixelSubset = WHOLE
+        self, data: StepDataModule, views: Iterable[int], subset: PixelSubset = ALL_PIXELS
     ) -> Iterator[ViewResult]:
         """Evaluates some of the held-out views, or some of their pixels."""
-        return self.evaluate_views(data.held_out(view, subset) for view in views)
+        return self.evaluate_views(data.get_held_out_view(view, subset) for view in views)
 
     def on_test_start(self) -> None:
-        give_back_freed_memory()
+        release_freed_memory()
 
     def test_step(self, batch: Any, batch_idx: int) -> dict[str, float]:
         result = self.evaluate(batch)
         truth = result.truth if result.known is None else result.truth[result.known][None]
-        plain = truth.mean((0, 1)).expand_as(truth)
-        figures = {"psnr": result.psnr, "ssim": result.ssim, "seconds": result.seconds}
-        return {**figures, "plain_psnr": psnr(plain, truth)}
+        constant_color = truth.mean((0, 1)).expand_as(truth)
+        metrics = {"psnr": result.psnr, "ssim": result.ssim, "seconds": result.seconds}
+        return {**metrics, "constant_color_psnr": psnr(constant_color, truth)}

@@ -10,14 +10,20 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config.options import check_run_options
-from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.errors import DiskFullError, InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
-from nerf_lightning.runs.folder import plain_config, save_config
-from nerf_lightning.runs.index import FINISHED, Run, find_runs, read_run
-from nerf_lightning.runs.owner import Taken, already, holds_run, leads, owned
-from nerf_lightning.training.sweep import ERROR, write_table
+from nerf_lightning.runs.folder import config_to_dict, save_config
+from nerf_lightning.runs.run_lock import (
+    RunFolderInUse,
+    has_run_outputs,
+    is_rank_zero,
+    lock_folder,
+    make_run_exists_error,
+)
+from nerf_lightning.runs.summaries import FINISHED, RunSummary, find_runs, read_run
+from nerf_lightning.training.sweep import ERROR_FILE, write_table
 from nerf_lightning.training.train import train
-from nerf_lightning.utils.files import full_disk, remove, write_json, write_text
+from nerf_lightning.utils.files import is_disk_full, remove_path, write_json, write_text
 from nerf_lightning.utils.signals import handle_signals
 
 
@@ -33,21 +39,21 @@ def run_job(cfg: DictConfig) -> float | None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     root = Path(HydraConfig.get().sweep.dir)
     try:
-        with handle_signals(), owned(folder):  # this may be a process of a launcher
+        with handle_signals(), lock_folder(folder):  # this may be a process of a launcher
             try:
                 return continue_job(cfg, folder)
             except Exception as error:  # noqa: BLE001  (recorded with its traceback; the other jobs must go on)
-                if leads():
+                if is_rank_zero():
                     record_error(folder, cfg, error)
-                if full_disk(error):  # and for the jobs after it
+                if is_disk_full(error):  # and for the jobs after it
                     raise
                 return None
-    except Taken as error:  # as by the same command a second time: what it does is not done twice
+    except RunFolderInUse as error:  # as by the same command a second time: what it does is not done twice
         print(f"{folder.name}: {error}", file=sys.stderr, flush=True)
         return None
     finally:
         with suppress(InputError):  # interrupted before any job wrote something, or a full disk, which has been told
-            if leads():
+            if is_rank_zero():
                 write_table(root, find_runs(root))
 
 
@@ -55,27 +61,27 @@ def continue_job(cfg: DictConfig, folder: Path) -> float | None:
     """The held-out PSNR of a job in a folder that this process owns, from now, from before, or from its last checkpoint on."""
     check_run_options(cfg, HydraConfig.get().runtime.choices)
     before = read_run(folder)
-    other = holds_run(folder) and before.config != plain_config(cfg)
+    other = has_run_outputs(folder) and before.config != config_to_dict(cfg)
     if other and before.status != "failed" and not cfg.overwrite:
-        raise already(folder)
+        raise make_run_exists_error(folder)
     done, checkpoint = find_progress(before, cfg)
-    if leads():
-        for name in (ERROR,) if done is not None else (ERROR, "results.json"):
-            remove(folder / name)
+    if is_rank_zero():
+        for name in (ERROR_FILE,) if done is not None else (ERROR_FILE, "results.json"):
+            remove_path(folder / name)
     if done is not None:
-        print(f"{folder.name}: done before ({done.status}, {done.quality})", flush=True)
+        print(f"{folder.name}: done before ({done.status}, {done.psnr_text})", flush=True)
         return done.psnr
     print(f"{folder.name}: {'starts' if checkpoint is None else 'continues from its last checkpoint'}", flush=True)
     return train(cfg, checkpoint)
 
 
-def find_progress(run: Run, cfg: DictConfig) -> tuple[Run | None, Path | None]:
+def find_progress(run: RunSummary, cfg: DictConfig) -> tuple[RunSummary | None, Path | None]:
     """How far a run is, if it has this configuration.
 
     Returns:
         The run, if it is finished; otherwise its last checkpoint, if there is one to continue from.
     """
-    if run.config != plain_config(cfg):
+    if run.config != config_to_dict(cfg):
         return None, None
     if run.status in FINISHED:
         return run, None
@@ -93,11 +99,11 @@ def record_error(folder: Path, cfg: DictConfig, error: Exception) -> None:
     diagnosis = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     diagnosis = " ".join(diagnosis.split())
     print(f"{folder.name}: failed: {diagnosis}", file=sys.stderr, flush=True)
-    with suppress(NoRoom):
+    with suppress(DiskFullError):
         if not (folder / "config.yaml").exists():
             with suppress(OmegaConfBaseException):  # the configuration itself may be what failed
                 save_config(cfg, folder)
-        if not isinstance(error, Taken) and read_run(folder).status != "failed":
+        if not isinstance(error, RunFolderInUse) and read_run(folder).status != "failed":
             results = {"method": cfg.get("method"), "seed": cfg.get("seed"), "status": "failed", "diagnosis": diagnosis}
             write_json(folder / "results.json", results | {"psnr": None, "curve": [], "warnings": [], "recoveries": []})
-        write_text(folder / ERROR, "".join(traceback.format_exception(error)))
+        write_text(folder / ERROR_FILE, "".join(traceback.format_exception(error)))

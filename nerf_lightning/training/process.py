@@ -12,10 +12,10 @@ from rich.console import Console
 
 from nerf_lightning.dataset import DataModule
 from nerf_lightning.errors import InputError
-from nerf_lightning.kernels import use_kernels
+from nerf_lightning.kernels import set_kernels
 from nerf_lightning.system import System
 from nerf_lightning.utils.memory import keep_freed_memory
-from nerf_lightning.utils.progress import animates
+from nerf_lightning.utils.progress import is_interactive
 
 
 def prepare_process(cfg: DictConfig, may_compile: bool = False) -> None:
@@ -26,7 +26,7 @@ def prepare_process(cfg: DictConfig, may_compile: bool = False) -> None:
     """
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    use_kernels("reference" if may_compile and cfg.compile else cfg.kernels)
+    set_kernels("reference" if may_compile and cfg.compile else cfg.kernels)
     keep_freed_memory()
     torch.set_flush_denormal(True)  # tiny weights otherwise slow the CPU down many times
     L.seed_everything(cfg.seed, verbose=False)
@@ -42,8 +42,8 @@ def check_processes(trainer: L.Trainer) -> None:
         return
     cluster = getattr(trainer.strategy, "cluster_environment", None)
     if HydraConfig.get().mode == RunMode.MULTIRUN and not getattr(cluster, "creates_processes_externally", False):
-        todo = "or a launcher that starts the processes itself"
-        raise InputError("config", "trainer.devices", str(trainer.world_size), "one process a job in a sweep", todo)
+        hint = "or a launcher that starts the processes itself"
+        raise InputError("config", "trainer.devices", str(trainer.world_size), "one process a job in a sweep", hint)
 
 
 def warm_up(system: System, data: DataModule, device: torch.device) -> None:
@@ -51,8 +51,8 @@ def warm_up(system: System, data: DataModule, device: torch.device) -> None:
 
     A CPU's kernels are compiled once and cached; those of `compile`, in every process.
     """
-    is_compiled = device.type == "cpu" or system.backend is not None
+    is_compiled = device.type == "cpu" or system.compile_backend is not None
     note = " (the first time they are compiled: half a minute)" if is_compiled else ""
     console = Console()
-    with console.status(f"getting the kernels ready{note}") if animates(console) else nullcontext():
-        copy.deepcopy(system).to(device).rehearse(data.small_batch())
+    with console.status(f"getting the kernels ready{note}") if is_interactive(console) else nullcontext():
+        copy.deepcopy(system).to(device).warm_up_kernels(data.make_warmup_batch())

@@ -11,7 +11,7 @@ from nerf_lightning.dataset import DataModule
 from nerf_lightning.refine import format_report, summarize_corrections
 from nerf_lightning.runs.scene_file import save_scene
 from nerf_lightning.system import System
-from nerf_lightning.utils.machine import CROWDED, crowding
+from nerf_lightning.utils.machine import MAX_BACKGROUND_LOAD, background_load
 from nerf_lightning.utils.text import join_truncated
 
 MAX_NAMED_PHOTOS = 10
@@ -34,10 +34,10 @@ def report_photos(system: System, data: DataModule, results: dict[str, Any], fol
         print(f"training photos that do not fit the others (a wrong pose, or something moved): {named}")
 
 
-def report(results: dict, folder: Path, logger: Logger | None) -> None:
+def report_results(results: dict, folder: Path, logger: Logger | None) -> None:
     """Prints the outcome."""
     for one in results["recoveries"]:
-        print(f"guard: at step {one['step']}: {one['cause']}; {one['action']}")
+        print(f"recovery: at step {one['step']}: {one['cause']}; {one['action']}")
     scene, seconds = results["scene"]["name"], results["train_seconds"]
     quality = "no PSNR" if results["psnr"] is None else f"{results['psnr']:.2f} dB"
     quality += " held out"
@@ -50,8 +50,8 @@ def report(results: dict, folder: Path, logger: Logger | None) -> None:
         print(f"measured on {share}; nerf_lightning evaluate {shlex.quote(str(folder))} measures all")
     if results["diagnosis"]:
         print(results["diagnosis"])
-    crowded = crowding(results)
-    if crowded is not None and crowded > CROWDED:
+    crowded = background_load(results)
+    if crowded is not None and crowded > MAX_BACKGROUND_LOAD:
         print(f"the machine was busy with something else, which took {crowded:.0%} of this run's threads")
     with suppress(ValueError):  # a folder elsewhere is printed with its full path
         folder = folder.relative_to(Path.cwd())

@@ -5,14 +5,14 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from nerf_lightning.config.build import build_data, resolved, with_photos
-from nerf_lightning.config.literal import escape
+from nerf_lightning.config.build import build_data, replace_photos, resolve_config
+from nerf_lightning.config.quoting import escape_interpolations
 from nerf_lightning.dataset import DataModule, RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
-from nerf_lightning.runs.data import data_again
 from nerf_lightning.runs.folder import load_config
-from nerf_lightning.runs.scene_file import load_scene
+from nerf_lightning.runs.reload import reload_data
+from nerf_lightning.runs.scene_file import read_scene_file
 
 
 def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
@@ -22,14 +22,19 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
     read_checkpoint(checkpoint, RESUME_KEYS)  # fails in one line before anything starts, if it is broken
     given = [override.partition("=")[0].lstrip("+") for override in HydraConfig.get().overrides.task]
     if "dataset.path" in given and cfg.dataset.path is not None:
-        saved = with_photos(saved, cfg.dataset.path)
+        saved = replace_photos(saved, cfg.dataset.path)
     for key in given:
         if key == "resume":
             continue
         if OmegaConf.select(saved, key, default=key) is key:
             raise InputError("resume", key, "an option the run does not have", f"one of those in {folder}/config.yaml")
         value = OmegaConf.select(cfg, key)
-        OmegaConf.update(saved, key, escape(resolved(value) if isinstance(value, DictConfig) else value), merge=False)
+        OmegaConf.update(
+            saved,
+            key,
+            escape_interpolations(resolve_config(value) if isinstance(value, DictConfig) else value),
+            merge=False,
+        )
     if "device" in given:  # the trainer's was resolved when the run began
         OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
     return saved, checkpoint
@@ -38,7 +43,7 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
 def load_data(cfg: DictConfig, scene: Scene | None, resumed: Path | None) -> DataModule:
     """The data to train on: a loaded scene, that of a resumed run in its frame, or the configuration's."""
     if resumed is not None:
-        return data_again(cfg, load_scene(resumed), cfg.dataset.get("path"), corrected=False)
+        return reload_data(cfg, read_scene_file(resumed), cfg.dataset.get("path"), corrected=False)
     if scene is None:
         return build_data(cfg)
-    return RayDataModule(scene, *(cfg.dataset[key] for key in ("rays", "samples", "seed", "focus")))
+    return RayDataModule(scene, *(cfg.dataset[key] for key in ("rays", "samples", "seed", "error_sampling")))

@@ -10,24 +10,24 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
 from nerf_lightning.config import resolvers  # noqa: F401  (a job's process needs them)
-from nerf_lightning.runs.index import FINISHED, Run, find_runs, varied
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.runs.summaries import FINISHED, RunSummary, find_runs, find_varying_options
+from nerf_lightning.utils.files import atomic_write
 
-TABLE = "sweep.csv"
-COLUMNS = ("psnr", "ssim", "train_seconds", "steps", "parameters", "artifact_bytes")
-ERROR = "error.txt"
+TABLE_FILE = "sweep.csv"
+METRIC_COLUMNS = ("psnr", "ssim", "train_seconds", "steps", "parameters", "artifact_bytes")
+ERROR_FILE = "error.txt"
 """In the folder of a job that failed, or was refused as another run's results are there."""
 
 
-def write_table(root: Path, runs: Sequence[Run]) -> None:
+def write_table(root: Path, runs: Sequence[RunSummary]) -> None:
     """Writes sweep.csv, a line for each job."""
-    with atomic(root / TABLE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(root / TABLE_FILE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        options = varied(runs)
-        writer.writerow(["job", "status", *options, *COLUMNS, "diagnosis"])
+        options = find_varying_options(runs)
+        writer.writerow(["job", "status", *options, *METRIC_COLUMNS, "diagnosis"])
         for run in runs:
-            figures = [run.results.get(column) for column in COLUMNS]
-            values = [run.option(key) for key in options]
+            figures = [run.results.get(column) for column in METRIC_COLUMNS]
+            values = [run.get_option(key) for key in options]
             writer.writerow([run.folder.relative_to(root), run.status, *values, *figures, run.diagnosis])
 
 
@@ -39,15 +39,17 @@ class SweepReport(Callback):
         print(f"sweep: {config.hydra.sweep.dir}, one folder a job, such as {config.hydra.sweep.subdir}", flush=True)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        from nerf_lightning.comparison.points import PUBLISHED, read_references
+        from nerf_lightning.comparison.points import PUBLISHED_FILE, read_references
         from nerf_lightning.comparison.report import write_comparison
 
         root = Path(config.hydra.sweep.dir)
         runs = find_runs(root)
-        left = [run for run in runs if run.status not in (*FINISHED, "stopped_early") or (run.folder / ERROR).exists()]
+        left = [
+            run for run in runs if run.status not in (*FINISHED, "stopped_early") or (run.folder / ERROR_FILE).exists()
+        ]
         try:
-            write_comparison(runs, root, read_references(PUBLISHED))
-            print(f"{root / TABLE}: a line for each job")
+            write_comparison(runs, root, read_references(PUBLISHED_FILE))
+            print(f"{root / TABLE_FILE}: a line for each job")
         finally:
             if left:
                 names = ", ".join(f"{run.folder.relative_to(root)} ({run.status})" for run in left)

@@ -14,34 +14,34 @@ from hydra.types import RunMode
 from lightning.pytorch.callbacks import LambdaCallback
 from omegaconf import DictConfig
 
-from nerf_lightning.callbacks import Budget, Live
-from nerf_lightning.callbacks.attached import attached
+from nerf_lightning.callbacks import Budget, LiveViewer
 from nerf_lightning.callbacks.results import summarize_run
+from nerf_lightning.callbacks.trainer_access import find_callback
 from nerf_lightning.config.build import (
     build_system,
     build_trainer,
     check_groups,
-    corrects_poses,
-    device_of,
-    frame_of,
-    resolved,
+    get_metadata,
+    has_pose_refinement,
+    resolve_config,
+    resolve_run_device,
 )
-from nerf_lightning.config.limits import limits_of
+from nerf_lightning.config.limits import get_limits
 from nerf_lightning.dataset import DataModule, Scene
-from nerf_lightning.errors import InputError, NoRoom
+from nerf_lightning.errors import DiskFullError, InputError
 from nerf_lightning.runs.find import link_latest
 from nerf_lightning.runs.folder import save_config
-from nerf_lightning.runs.owner import clear
+from nerf_lightning.runs.run_lock import delete_run_outputs
 from nerf_lightning.runs.scene_file import save_scene
 from nerf_lightning.system import System
-from nerf_lightning.system.compiled import BACKEND, check_compiler
-from nerf_lightning.training.loggers import finishing_wandb, log_summary
+from nerf_lightning.system.torch_compile import COMPILE_BACKEND, check_compiler
+from nerf_lightning.training.loggers import finish_wandb, log_summary
 from nerf_lightning.training.process import check_processes, prepare_process, warm_up
-from nerf_lightning.training.report import report, report_photos
+from nerf_lightning.training.report import report_photos, report_results
 from nerf_lightning.training.resume import load_data, resume
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.libraries import silence_lightning
-from nerf_lightning.utils.memory import check_memory, out_of_memory
+from nerf_lightning.utils.memory import check_memory, out_of_memory_error
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class TrainingRun:
     """What is doubtful about the photos."""
 
 
-@finishing_wandb()
+@finish_wandb()
 def train(
     cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None = None, scene: Scene | None = None
 ) -> float:
@@ -80,37 +80,37 @@ def train(
         cfg, checkpoint = resume(cfg, folder)
     device = prepare(cfg)
     data = load_data(cfg, scene, folder if is_resumed else None)
-    run = build(cfg, data, device, folder, checkpoint)
+    run = build_run(cfg, data, device, folder, checkpoint)
     results = fit_and_test(run, checkpoint)
     if run.trainer.is_global_zero:
         summarize(run, results)
-    if (live := attached(run.trainer, Live)) is not None:
+    if (live := find_callback(run.trainer, LiveViewer)) is not None:
         in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
-        live.finish(results["psnr"], stay=not in_sweep)
+        live.finish(results["psnr"], keep_open=not in_sweep)
     quality: float | None = results["psnr"]
     return math.nan if quality is None else quality  # views of a field that has broken down may have none
 
 
 def prepare(cfg: DictConfig) -> torch.device:
     """Sets up the process and checks the options of all groups. Returns the device."""
-    device = device_of(cfg)
+    device = resolve_run_device(cfg)
     silence_lightning()
     prepare_process(cfg, may_compile=True)
     if cfg.compile:
-        check_compiler(device, BACKEND)
+        check_compiler(device, COMPILE_BACKEND)
     check_groups(cfg)
     return device
 
 
-def build(
+def build_run(
     cfg: DictConfig, data: DataModule, device: torch.device, folder: Path, checkpoint: Path | None
 ) -> TrainingRun:
     """Makes system and trainer for the data, checks that they fit each other, and empties the folder unless a run continues."""
-    data.enlarge(limits_of(cfg, device).batch)
-    doubts = data.find_doubts(corrects_poses(cfg))
+    data.scale_batch(get_limits(cfg, device).batch_scale)
+    doubts = data.find_issues(has_pose_refinement(cfg))
     for doubt in doubts:
         log.warning("%s: %s", data.scene.name, doubt.text)
-    system = prepare_system(cfg, data, device, any(doubt.far_off for doubt in doubts))
+    system = prepare_system(cfg, data, device, any(doubt.has_wrong_poses for doubt in doubts))
     trainer = build_trainer(cfg, folder, device)
     check_processes(trainer)
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
@@ -118,7 +118,7 @@ def build(
             check(data)
     if trainer.is_global_zero:
         if checkpoint is None:
-            clear(folder)
+            delete_run_outputs(folder)
         first = LambdaCallback(on_train_start=lambda *_: write_description(cfg, data, folder))
         trainer.callbacks.insert(0, first)  # type: ignore[attr-defined]
     with trainer.precision_plugin.train_step_context():
@@ -139,13 +139,13 @@ def prepare_system(cfg: DictConfig, data: DataModule, device: torch.device, pose
     Raises:
         InputError: it needs more memory than is free, trained at its largest, or does not fit the data.
     """
-    system = build_system(cfg, frame_of(data), device)
+    system = build_system(cfg, get_metadata(data), device)
     what = "numbers, with their gradients and moments,"
     check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
     if system.corrections is not None and poses_are_off:
-        system.corrections.enable_poses_at_once()
-    if system.field.sizing:
-        log.info("model: %s", system.field.sizing)
+        system.corrections.enable_poses()
+    if system.field.size_message:
+        log.info("model: %s", system.field.size_message)
     return system
 
 
@@ -158,7 +158,7 @@ def fit_and_test(run: TrainingRun, checkpoint: Path | None) -> dict[str, Any]:
         trainer.test(run.system, run.data, verbose=False)
     except BaseException as error:
         if trainer.is_global_zero and has_trained(trainer, error):
-            with suppress(NoRoom):  # on a full disk what happened first is to be told
+            with suppress(DiskFullError):  # on a full disk what happened first is to be told
                 write_json(path, summarize_run(*options, error))
         raise
     results = summarize_run(*options)
@@ -177,8 +177,8 @@ def fit(run: TrainingRun, checkpoint: Path | None) -> None:
         run.trainer.fit(run.system, run.data, ckpt_path=checkpoint, weights_only=True)
     except Exception as error:
         if not has_trained(run.trainer, error) and checkpoint is None and run.trainer.is_global_zero:
-            clear(run.folder)
-        if checkpoint is None or run.system.state.clock.started or isinstance(error, InputError):
+            delete_run_outputs(run.folder)
+        if checkpoint is None or run.system.state.clock.has_started or isinstance(error, InputError):
             raise
         found = f"{type(error).__name__}: {error}"  # only the checkpoint has been at work yet
         raise InputError(checkpoint, "", found, "a state of this run to continue from", "start the run anew") from error
@@ -186,12 +186,14 @@ def fit(run: TrainingRun, checkpoint: Path | None) -> None:
 
 def has_trained(trainer: L.Trainer, error: BaseException) -> bool:
     """Whether an error came after the start of training, and not from a first step that did not fit into memory."""
-    return Budget.of(trainer).state.clock.started and not (trainer.global_step == 0 and out_of_memory(error))
+    return Budget.find(trainer).state.clock.has_started and not (
+        trainer.global_step == 0 and out_of_memory_error(error)
+    )
 
 
 def summarize(run: TrainingRun, results: dict[str, Any]) -> None:
     """Saves corrected cameras, logs the final figures, and prints the outcome."""
     report_photos(run.system, run.data, results, run.folder)
     if run.trainer.logger is not None:
-        log_summary(run.trainer.logger, resolved(run.cfg), results)
-    report(results, run.folder, run.trainer.logger)
+        log_summary(run.trainer.logger, resolve_config(run.cfg), results)
+    report_results(results, run.folder, run.trainer.logger)

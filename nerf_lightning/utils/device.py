@@ -7,7 +7,7 @@ from nerf_lightning.errors import InputError
 CPU = torch.device("cpu")
 
 
-def devices() -> list[str]:
+def available_devices() -> list[str]:
     """The kinds of devices available, best first, then any that is registered with torch. The CPU is always there."""
     found = [name for name, kind in (("cuda", torch.cuda), ("mps", torch.backends.mps)) if kind.is_available()]
     own = torch._C._get_privateuse1_backend_name()
@@ -16,7 +16,7 @@ def devices() -> list[str]:
     return [*found, "cpu", *([own] if registered else [])]
 
 
-def the_device(name: str) -> torch.device:
+def resolve_device(name: str) -> torch.device:
     """The device with a name.
 
     Args:
@@ -25,7 +25,7 @@ def the_device(name: str) -> torch.device:
     Raises:
         InputError: for another name, or a device that is not available.
     """
-    found = devices()
+    found = available_devices()
     if name == "auto":
         return torch.device(found[0])
     if name in found:

@@ -7,21 +7,21 @@ import warnings
 
 from nerf_lightning.errors import InputError
 
-NOISY = ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero")
+LIGHTNING_LOGGERS = ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero")
 """Loggers that report hardware and advice."""
-SPIN_COUNT = 2000
+OPENMP_SPIN_COUNT = 2000
 """Rounds that GNU's OpenMP waits (some microseconds) before it gives its core away. With its own 300,000 (a millisecond) two
 trainings side by side on two cores took 4 to 6 times as long as one alone, with this 1.8 times; alone nothing changes."""
 
 
-def require(extra: str, *packages: str, purpose: str, otherwise: str = "") -> None:
+def require_extra(extra: str, *packages: str, purpose: str, hint: str = "") -> None:
     """Raises InputError where a package of an optional extra is not installed.
 
     Args:
         extra: its name in pyproject.toml.
         packages: what it brings.
         purpose: what it is for, in words.
-        otherwise: what else the user can do.
+        hint: what else the user can do.
     """
     for package in packages:
         try:
@@ -29,13 +29,13 @@ def require(extra: str, *packages: str, purpose: str, otherwise: str = "") -> No
         except ModuleNotFoundError as error:
             if error.name != package:
                 raise
-            todo = f"pip install 'nerf_lightning[{extra}]'{otherwise}"
-            raise InputError(package, "", "no such package", purpose, todo) from error
+            hint = f"pip install 'nerf_lightning[{extra}]'{hint}"
+            raise InputError(package, "", "no such package", purpose, hint) from error
 
 
 def silence_lightning() -> None:
     """Silences Lightning's remarks on hardware and settings that this package chooses itself."""
-    for name in NOISY:
+    for name in LIGHTNING_LOGGERS:
         logging.getLogger(name).setLevel(logging.WARNING)
     for part in (
         "does not have many workers",
@@ -46,7 +46,7 @@ def silence_lightning() -> None:
         warnings.filterwarnings("ignore", f".*{part}.*")
 
 
-def shorten_openmp_waits() -> None:
-    """Sets `SPIN_COUNT`, before PyTorch is loaded, which reads it; unless the user's environment says how to wait."""
+def limit_openmp_spinning() -> None:
+    """Sets `OPENMP_SPIN_COUNT`, before PyTorch is loaded, which reads it; unless the user's environment says how to wait."""
     if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", str(SPIN_COUNT))
+        os.environ.setdefault("GOMP_SPINCOUNT", str(OPENMP_SPIN_COUNT))

@@ -10,20 +10,20 @@ from typing import Any
 import psutil
 import torch
 
-CROWDED = 0.1
+MAX_BACKGROUND_LOAD = 0.1
 """A machine counts as busy if other work took more than this share of a run's threads."""
-MIN_SECONDS = 0.5
+MIN_LOAD_SECONDS = 0.5
 """Shortest time, in seconds, over which the load can be measured: the system counts in hundredths."""
 
 
-def cores() -> int:
+def available_cores() -> int:
     """Processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def processor() -> str:
+def processor_name() -> str:
     """The processor's name, if the system knows it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -33,7 +33,7 @@ def processor() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def accelerator(device: torch.device) -> str | None:
+def accelerator_name(device: torch.device) -> str | None:
     """The name of the accelerator, or of its kind if unknown; None for a CPU."""
     if device.type == "cpu":
         return None
@@ -42,18 +42,18 @@ def accelerator(device: torch.device) -> str | None:
     return device.type
 
 
-def device_in_words(device: torch.device) -> str:
+def describe_device(device: torch.device) -> str:
     """For messages: "cpu", or for example "cuda (NVIDIA H100)"."""
-    name = accelerator(device)
+    name = accelerator_name(device)
     return device.type if name in (None, device.type) else f"{device.type} ({name})"
 
 
 def describe_machine(device: torch.device) -> dict[str, Any]:
     """The machine, for results.json."""
-    return {"processor": processor(), "cores": cores(), "accelerator": accelerator(device)}
+    return {"processor": processor_name(), "cores": available_cores(), "accelerator": accelerator_name(device)}
 
 
-def crowding(results: Mapping[str, Any]) -> float | None:
+def background_load(results: Mapping[str, Any]) -> float | None:
     """Share of a run's threads taken by other work, which used more than the cores the run left free; None if unknown."""
     try:
         threads, cores = float(results["threads"]), float(results["machine"]["cores"])
@@ -71,30 +71,30 @@ def _busy_seconds() -> float:
     return sum(times) - idle - guests
 
 
-class Load:
+class CpuLoad:
     """CPU seconds spent between `start` and `stop`, by this process and by everything else."""
 
     def __init__(self) -> None:
         self.seconds = self.own = self.others = 0.0
-        self._since: tuple[float, float, float] | None = None
+        self._started: tuple[float, float, float] | None = None
 
     @staticmethod
-    def _now() -> tuple[float, float, float]:
+    def _read_clocks() -> tuple[float, float, float]:
         return time.perf_counter(), time.process_time(), _busy_seconds()
 
     def start(self) -> None:
-        self._since = self._now()
+        self._started = self._read_clocks()
 
     def stop(self) -> None:
         """Adds the time since `start`, if it was called."""
-        if self._since is None:
+        if self._started is None:
             return
-        wall, own, busy = (now - then for now, then in zip(self._now(), self._since, strict=True))
-        self._since = None
+        wall, own, busy = (now - then for now, then in zip(self._read_clocks(), self._started, strict=True))
+        self._started = None
         self.seconds, self.own, self.others = self.seconds + wall, self.own + own, self.others + busy - own
 
-    def cores(self) -> dict[str, float] | None:
+    def average_cores(self) -> dict[str, float] | None:
         """Cores in use on average; None if too little time has passed."""
-        if self.seconds < MIN_SECONDS:
+        if self.seconds < MIN_LOAD_SECONDS:
             return None
         return {"own": round(self.own / self.seconds, 3), "others": round(max(0.0, self.others) / self.seconds, 3)}

@@ -11,7 +11,7 @@ import torch
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.device import CPU
 
-CONTAINER = Path("/sys/fs/cgroup")
+CGROUP_FOLDER = Path("/sys/fs/cgroup")
 """Files on the memory of a Linux container."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h of the GNU C library
 
@@ -24,7 +24,7 @@ def free_memory(device: torch.device = CPU) -> float:
         return float(torch.mps.recommended_max_memory() - torch.mps.driver_allocated_memory())
     free = float(psutil.virtual_memory().available)
     try:
-        limit, used, details = ((CONTAINER / f"memory.{name}").read_text() for name in ("max", "current", "stat"))
+        limit, used, details = ((CGROUP_FOLDER / f"memory.{name}").read_text() for name in ("max", "current", "stat"))
     except OSError:  # no container
         return free
     if limit.strip() == "max":
@@ -33,37 +33,37 @@ def free_memory(device: torch.device = CPU) -> float:
     return max(min(free, float(limit) - float(used) + float(cached[1] if cached else 0)), 0.0)
 
 
-def fits(size: int, device: torch.device) -> bool:
+def fits_in_memory(size: int, device: torch.device) -> bool:
     """Whether `size` bytes take at most half of an accelerator's free memory; always on a CPU, which holds them already."""
     return device.type == "cpu" or size <= free_memory(device) / 2
 
 
 def check_memory(
-    where: object, key: str, what: str, needed: float, todo: str = "give less", device: torch.device = CPU
+    where: object, key: str, item: str, size: float, hint: str = "give less", device: torch.device = CPU
 ) -> None:
     """Refuses what certainly needs more memory than is free.
 
     Args:
-        where, key, todo: see `InputError`.
-        what: the things, in words.
-        needed: bytes that they take at least.
+        where, key, hint: see `InputError`.
+        item: what needs the memory, plural.
+        size: lower bound of its bytes.
         device: whose memory.
 
     Raises:
         InputError: where more is needed than is free.
     """
     free = free_memory(device)
-    if not needed <= free:
-        found, there = (f"{part / 2**30:,.1f} GiB" for part in (needed, free))
-        raise InputError(where, key, f"{what} that take at least {found}", f"at most the {there} that are free", todo)
+    if not size <= free:
+        found, there = (f"{part / 2**30:,.1f} GiB" for part in (size, free))
+        raise InputError(where, key, f"{item} that take at least {found}", f"at most the {there} that are free", hint)
 
 
-def out_of_memory(error: BaseException) -> InputError | None:
+def out_of_memory_error(error: BaseException) -> InputError | None:
     """The error to report where memory has run out; None for one of another kind. CPUs say so only where a limit is set."""
     if not isinstance(error, MemoryError | torch.OutOfMemoryError) and "allocate memory" not in str(error):
         return None
     size = re.search(r"allocate ([\d.]+ \w+)", str(error))
-    less = "dataset.rays, dataset.samples, dataset.pixels, limits.batch or limits.chunk"
+    less = "dataset.rays, dataset.samples, dataset.pixels, limits.batch_scale or limits.chunk_samples"
     found = f"no memory for {size[1] if size else 'a tensor'}"
     return InputError("memory", "", found, "what fits into it", f"give less of {less}, or a smaller model")
 
@@ -77,7 +77,7 @@ def keep_freed_memory() -> None:
             ctypes.CDLL(None).mallopt(setting, value)
 
 
-def give_back_freed_memory() -> None:
+def release_freed_memory() -> None:
     """Returns kept memory to the system, where the C library can: between kinds of work, which need it in other pieces."""
     with suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

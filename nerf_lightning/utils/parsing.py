@@ -18,7 +18,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.memory import check_memory
 
 MAX_YAML_BYTES = 1 << 20
-JSON_BYTES_PER_BYTE = 32
+JSON_MEMORY_PER_BYTE = 32
 """Of memory for a byte of JSON: `{},` becomes 72 bytes."""
 VALUE_ERRORS = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
 """What Python and libraries raise for values of a wrong kind, where a file's content goes through code that trusts it."""
@@ -29,39 +29,39 @@ DAMAGE_ERRORS = (
 """What zipfile, NumPy and PyTorch raise for a damaged file."""
 
 
-def existing_file(path: Path, expected: str = "a file", missing: str = "check the path") -> Path:
-    """Refuses a folder, and what is no ordinary file: a pipe or a device may never end; `missing` is what to do without one."""
+def require_file(path: Path, expected: str = "a file", missing_hint: str = "check the path") -> Path:
+    """Refuses a folder, and what is no regular file, as a pipe may never end; `missing_hint` is for the message."""
     if path.is_dir():
         raise InputError(path, "", "a folder", expected)
     if not path.is_file():
-        raise InputError(path, "", "nothing there", expected, missing)
+        raise InputError(path, "", "nothing there", expected, missing_hint)
     return path
 
 
-def read_content(path: Path, expected: str = "a file that can be read", cost: float = 1) -> bytes:
-    """All bytes of a file, of which each will need `cost` bytes of memory.
+def read_file(path: Path, expected: str = "a file that can be read", memory_per_byte: float = 1) -> bytes:
+    """All bytes of a file, of which each will need `memory_per_byte` bytes of memory.
 
     Raises:
         InputError: it is missing, cannot be read, or is too large for the memory that is left.
     """
-    existing_file(path, expected)
+    require_file(path, expected)
     try:
-        check_memory(path, "", "content", path.stat().st_size * cost)
+        check_memory(path, "", "content", path.stat().st_size * memory_per_byte)
         return path.read_bytes()
     except OSError as error:
         raise InputError(path, "", f"something unreadable ({error})", expected) from error
 
 
-def read_json(path: Path, expected: str, todo: str = "export it again") -> Any:
-    """What a JSON file holds, in UTF-8, UTF-16 or UTF-32; `expected` and `todo` are for messages.
+def read_json(path: Path, expected: str, hint: str = "export it again") -> Any:
+    """What a JSON file holds, in UTF-8, UTF-16 or UTF-32; `expected` and `hint` are for messages.
 
     Raises:
-        InputError: as `read_content`, and where it is no JSON.
+        InputError: as `read_file`, and where it is no JSON.
     """
-    return parse_json(read_content(path, expected, JSON_BYTES_PER_BYTE), path, expected, todo)
+    return parse_json(read_file(path, expected, JSON_MEMORY_PER_BYTE), path, expected, hint)
 
 
-def parse_json(content: bytes, where: object, expected: str, todo: str = "") -> Any:
+def parse_json(content: bytes, where: object, expected: str, hint: str = "") -> Any:
     """As `read_json`, of a file's content; `where` it came from is for messages.
 
     Raises:
@@ -70,7 +70,7 @@ def parse_json(content: bytes, where: object, expected: str, todo: str = "") -> 
     try:
         return json.loads(content.decode(json.detect_encoding(content)))
     except (RecursionError, ValueError, MemoryError) as error:
-        raise InputError(where, "", f"broken JSON ({type(error).__name__}: {error})", expected, todo) from error
+        raise InputError(where, "", f"broken JSON ({type(error).__name__}: {error})", expected, hint) from error
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -84,24 +84,24 @@ class _PlainLoader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
-def read_yaml(path: Path, expected: str, todo: str = "") -> Any:
-    """What a YAML file holds: plain values; `expected` and `todo` are for messages.
+def read_yaml(path: Path, expected: str, hint: str = "") -> Any:
+    """What a YAML file holds: plain values; `expected` and `hint` are for messages.
 
     Raises:
-        InputError: as `read_content`, and where it is no YAML, larger than `MAX_YAML_BYTES`, or has aliases.
+        InputError: as `read_file`, and where it is no YAML, larger than `MAX_YAML_BYTES`, or has aliases.
     """
-    if (size := existing_file(path, expected).stat().st_size) > MAX_YAML_BYTES:
-        raise InputError(path, "", f"{size} bytes", f"{expected}, of at most {MAX_YAML_BYTES} bytes", todo)
-    content = read_content(path, expected)
+    if (size := require_file(path, expected).stat().st_size) > MAX_YAML_BYTES:
+        raise InputError(path, "", f"{size} bytes", f"{expected}, of at most {MAX_YAML_BYTES} bytes", hint)
+    content = read_file(path, expected)
     try:
         return yaml.load(content.decode("utf-8-sig"), _PlainLoader)  # noqa: S506  (a SafeLoader)
     except (yaml.YAMLError, *VALUE_ERRORS) as error:  # Python's own for a date or a number that is none
-        raise InputError(path, "", f"no YAML ({type(error).__name__}: {error})", expected, todo) from error
+        raise InputError(path, "", f"no YAML ({type(error).__name__}: {error})", expected, hint) from error
 
 
 def read_npz(
     source: Path | bytes,
-    known: Iterable[str] | None,
+    keys: Iterable[str] | None,
     where: object = None,
     expected: str = "plain numeric arrays in a whole .npz file",
 ) -> dict[str, np.ndarray]:
@@ -109,7 +109,7 @@ def read_npz(
 
     Args:
         source: the file, or its content.
-        known: names of the arrays to read, as far as they are there; None reads all.
+        keys: names of the arrays to read, as far as they are there; None reads all.
         where: a content came from, for messages.
         expected: for messages.
 
@@ -117,11 +117,11 @@ def read_npz(
         InputError: it is no such file, is damaged, holds pickled objects, or unpacks to more than fits into memory.
     """
     if isinstance(source, Path):
-        where = existing_file(source, expected)
+        where = require_file(source, expected)
     file = source if isinstance(source, Path) else io.BytesIO(source)
-    with _reporting_damage(where, expected), zipfile.ZipFile(file) as archive:
+    with _damage_as_input_error(where, expected), zipfile.ZipFile(file) as archive:
         members = {member.filename.removesuffix(".npy"): member for member in archive.infolist()}
-        names = list(members) if known is None else [name for name in known if name in members]
+        names = list(members) if keys is None else [name for name in keys if name in members]
         check_memory(where, "", "arrays", sum(members[name].file_size for name in names))
         arrays = {}
         for name in names:
@@ -136,14 +136,14 @@ def read_npy(path: Path) -> np.ndarray:
     Raises:
         InputError: it is no such file, is damaged or cut short, or holds pickled objects.
     """
-    existing_file(path)
+    require_file(path)
     check_memory(path, "", "an array", path.stat().st_size)
-    with _reporting_damage(path, "an .npy array of numbers"), path.open("rb") as file:
+    with _damage_as_input_error(path, "an .npy array of numbers"), path.open("rb") as file:
         return np.lib.format.read_array(file, allow_pickle=False)
 
 
 @contextmanager
-def _reporting_damage(where: object, expected: str) -> Iterator[None]:
+def _damage_as_input_error(where: object, expected: str) -> Iterator[None]:
     try:
         yield
     except InputError:

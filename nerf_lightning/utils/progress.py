@@ -11,31 +11,31 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 T = TypeVar("T")
 
 
-def clock(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """1:02:03 or 2:03."""
     minutes, second = divmod(round(seconds), 60)
     hours, minute = divmod(minutes, 60)
     return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
 
 
-def animates(console: Console) -> bool:
+def is_interactive(console: Console) -> bool:
     """Whether a console can show a moving bar: a terminal can, and a notebook with ipywidgets."""
     return console.is_terminal or (console.is_jupyter and find_spec("ipywidgets") is not None)
 
 
-def tracked(items: Iterable[T], total: int, words: str) -> Iterator[T]:
+def track_progress(items: Iterable[T], total: int, description: str) -> Iterator[T]:
     """Yields the items while a bar shows their count and the time left; where it can move."""
-    with counted(total, words) as step:
+    with progress_bar(total, description) as step:
         for item in items:
             yield item
             step(1)
 
 
 @contextmanager
-def counted(total: int, words: str) -> Iterator[Callable[[int], None]]:
+def progress_bar(total: int, description: str) -> Iterator[Callable[[int], None]]:
     """Yields what to call after a number of items, for work that is no loop of our own."""
     console = Console(stderr=True)
-    columns = TextColumn(words), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True, disable=not animates(console)) as bar:
-        task = bar.add_task(words, total=total)
+    columns = TextColumn(description), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    with Progress(*columns, console=console, transient=True, disable=not is_interactive(console)) as bar:
+        task = bar.add_task(description, total=total)
         yield lambda count: bar.advance(task, count)

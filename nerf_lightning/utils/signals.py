@@ -10,34 +10,34 @@ from functools import partial
 from types import FrameType
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-CONTINUE = "the same command continues"
-_received: int | None = None
-_deferred = False
+RESUME_HINT = "the same command continues"
+_received_signal: int | None = None
+_is_deferred = False
 
 
-class Interrupted(BaseException):
+class SignalInterrupt(BaseException):
     """A signal; `hint` says what continues the work. No KeyboardInterrupt, which Lightning turns into exit code 1."""
 
-    def __init__(self, signum: int, hint: str = CONTINUE):
+    def __init__(self, signum: int, hint: str = RESUME_HINT):
         super().__init__(signum)
         self.signum, self.hint = signum, hint
 
 
 @contextmanager
 def handle_signals() -> Iterator[None]:
-    """Within the block a signal raises `Interrupted`, inside `defer_signals` at the end of that. Nested, it does nothing."""
-    global _received
+    """A signal raises `SignalInterrupt`, inside `defer_signals` at the end of that. Nested, it does nothing."""
+    global _received_signal
     handlers = {signum: signal.getsignal(signum) for signum in SIGNALS}
     if _handle in handlers.values() or threading.current_thread() is not threading.main_thread():
         yield
         return
     install_handlers()
     hook = sys.unraisablehook
-    sys.unraisablehook = partial(_raise_again, hook)
+    sys.unraisablehook = partial(_resend_signal, hook)
     try:
         yield
     finally:
-        _received, sys.unraisablehook = None, hook
+        _received_signal, sys.unraisablehook = None, hook
         for signum, handler in handlers.items():
             signal.signal(signum, handler)
 
@@ -55,57 +55,59 @@ def exit_on_signal() -> Iterator[None]:
     with handle_signals():
         try:
             yield
-        except BaseException as error:  # a library may have turned `Interrupted` into an error of its own
-            if _received is None:
+        except BaseException as error:  # a library may have turned `SignalInterrupt` into an error of its own
+            if _received_signal is None:
                 raise
-            hint = error.hint if isinstance(error, Interrupted) else CONTINUE
+            hint = error.hint if isinstance(error, SignalInterrupt) else RESUME_HINT
             print(
-                f"nerf_lightning: interrupted ({signal.Signals(_received).name}); {hint}", file=sys.stderr, flush=True
+                f"nerf_lightning: interrupted ({signal.Signals(_received_signal).name}); {hint}",
+                file=sys.stderr,
+                flush=True,
             )
-            sys.exit(128 + _received)
+            sys.exit(128 + _received_signal)
 
 
 @contextmanager
 def defer_signals(deferred: bool = True) -> Iterator[None]:
     """Defers the first signal to the end of a block; with False, lets it interrupt a part of such a block."""
-    global _deferred
-    before, _deferred = _deferred, deferred
+    global _is_deferred
+    before, _is_deferred = _is_deferred, deferred
     try:
         if not deferred:
             raise_if_signalled()
         yield
     finally:
-        _deferred = before
-    if not _deferred:
+        _is_deferred = before
+    if not _is_deferred:
         raise_if_signalled()
 
 
 def received_signal() -> int | None:
     """The signal that asks this process to end, if one has come."""
-    return _received
+    return _received_signal
 
 
 def raise_if_signalled() -> None:
-    if _received is not None:
-        raise Interrupted(_received)
+    if _received_signal is not None:
+        raise SignalInterrupt(_received_signal)
 
 
-def _raise_again(hook: Callable[["sys.UnraisableHookArgs"], object], lost: "sys.UnraisableHookArgs") -> None:
-    """Sends a signal once more whose `Interrupted` could not be raised, as in the callbacks of Numba's compiler."""
-    global _received
-    if isinstance(lost.exc_value, Interrupted):
-        _received = None
+def _resend_signal(hook: Callable[["sys.UnraisableHookArgs"], object], lost: "sys.UnraisableHookArgs") -> None:
+    """Sends a signal once more whose `SignalInterrupt` could not be raised, as in the callbacks of Numba's compiler."""
+    global _received_signal
+    if isinstance(lost.exc_value, SignalInterrupt):
+        _received_signal = None
         threading.Timer(0.02, os.kill, (os.getpid(), lost.exc_value.signum)).start()
     else:
         hook(lost)
 
 
 def _handle(signum: int, frame: FrameType | None) -> None:
-    global _received
-    if _received is not None:
+    global _received_signal
+    if _received_signal is not None:
         os._exit(128 + signum)
-    _received = signum
-    if _deferred:  # os.write, as a print may be under way
+    _received_signal = signum
+    if _is_deferred:  # os.write, as a print may be under way
         os.write(2, f"nerf_lightning: {signal.Signals(signum).name}: stopping soon; again stops at once\n".encode())
     else:
         raise_if_signalled()

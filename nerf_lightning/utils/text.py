@@ -17,7 +17,7 @@ def suggest(name: str, known: Iterable[str], prefix: str = "") -> str:
     return f"did you mean {prefix}{near[0]}?" if near else ""
 
 
-def join_truncated(names: Sequence[str], most: int) -> str:
+def join_truncated(names: Sequence[str], limit: int) -> str:
     """At most so many of the names, and how many more there are."""
-    rest = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + rest
+    rest = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + rest

@@ -12,16 +12,16 @@ import viser
 from viser.transforms import SO3
 
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.drawing.ink import BLUE, ORANGE, rgb
-from nerf_lightning.view.drawing import Frustum, Viewpoint, frusta, through
+from nerf_lightning.drawing.style import BLUE, ORANGE, parse_hex_colour
+from nerf_lightning.view.geometry import Frustum, Viewpoint, get_photo_viewpoint, iterate_frusta
 
-COLOURS = {"training": rgb(BLUE), "held out": rgb(ORANGE)}
+SPLIT_COLOURS = {"training": parse_hex_colour(BLUE), "held out": parse_hex_colour(ORANGE)}
 """Of the cameras of a split."""
-PHOTO_SIDE = 160
+MAX_PHOTO_SIDE = 160
 """Longest side of the photos on the frusta, pixels."""
-LINE = 1.5
+LINE_WIDTH = 1.5
 """Width of lines, screen pixels."""
-FRUSTUM_DEPTH = 0.12
+FRUSTUM_DEPTH_FRACTION = 0.12
 """Depth of a frustum at first, as a share of the cameras' distance to what they look at."""
 
 
@@ -40,12 +40,12 @@ class Page:
         self.name = name
         self.home = home
         self.scale = scale
-        self.redrawing = threading.Lock()  # callbacks come from many threads
+        self.draw_lock = threading.Lock()  # callbacks come from many threads
         self.groups: dict[str, viser.FrameHandle] = {}
         self.names: list[viser.FrameHandle] = []
-        self.pyramids: list[tuple[Frustum, viser.CameraFrustumHandle]] = []
+        self.frusta: list[tuple[Frustum, viser.CameraFrustumHandle]] = []
         logging.getLogger("websockets").setLevel(logging.WARNING)
-        with _hushed():
+        with _silence_stdout():
             self.server = viser.ViserServer(host, port, verbose=False)
 
     @property
@@ -57,10 +57,10 @@ class Page:
         threading.Event().wait()
 
     def stop(self) -> None:
-        with _hushed():
+        with _silence_stdout():
             self.server.stop()
 
-    def set_stage(self) -> None:
+    def set_up_scene(self) -> None:
         """Lights, sizes and the first view; nothing that a browser would load from elsewhere."""
         scene, gui, camera = self.server.scene, self.server.gui, self.server.initial_camera
         gui.configure_theme(show_logo=False, show_share_button=False)
@@ -83,17 +83,17 @@ class Page:
             group = word.replace(" ", "_")
             self.groups[word] = scene.add_frame(f"/{group}", show_axes=False, visible=visible)
             self.names.append(scene.add_frame(f"/{group}/names", show_axes=False, visible=False))
-            for i, frustum in enumerate(frusta(views, PHOTO_SIDE)):
+            for i, frustum in enumerate(iterate_frusta(views, MAX_PHOTO_SIDE)):
                 wxyz = SO3.from_matrix(frustum.c2w[:3, :3].astype(np.float64)).wxyz
                 position = frustum.c2w[:3, 3]
                 handle = scene.add_camera_frustum(
                     f"/{group}/{i}",
                     frustum.fov,
                     frustum.aspect,
-                    scale=viser_scale(frustum, FRUSTUM_DEPTH * self.scale),
-                    thickness=LINE,
+                    scale=viser_scale(frustum, FRUSTUM_DEPTH_FRACTION * self.scale),
+                    thickness=LINE_WIDTH,
                     thickness_units="screen",
-                    color=COLOURS[word],
+                    color=SPLIT_COLOURS[word],
                     image=frustum.photo,
                     wxyz=wxyz,
                     position=position,
@@ -101,25 +101,25 @@ class Page:
                     receive_shadow=False,
                 )
                 handle.on_click(self._visit(frustum))
-                self.pyramids.append((frustum, handle))
+                self.frusta.append((frustum, handle))
                 scene.add_label(f"/{group}/names/{i}", frustum.name, position=position, font_screen_scale=0.8)
 
     def _visit(self, frustum: Frustum) -> Callable[[viser.SceneNodePointerEvent], None]:
         """A click on a frustum moves the browser's camera there."""
-        return lambda event: look_from(event.client, through(frustum, self.scale, self.home.up))
+        return lambda event: look_from(event.client, get_photo_viewpoint(frustum, self.scale, self.home.up))
 
-    def add_camera_switches(self) -> None:
+    def add_camera_checkboxes(self) -> None:
         """Checkboxes for what to show of the cameras."""
         gui = self.server.gui
         for word, group in self.groups.items():
-            self.switch(word, group)
-        self.switch("names", *self.names)
+            self.add_checkbox(word, group)
+        self.add_checkbox("names", *self.names)
         self.photos = gui.add_checkbox("photos", True)
         self.photos.on_update(lambda _: self.show_photos())
-        self.depth = gui.add_slider("camera size", 0.01, 0.5, 0.01, FRUSTUM_DEPTH)
+        self.depth = gui.add_slider("camera size", 0.01, 0.5, 0.01, FRUSTUM_DEPTH_FRACTION)
         self.depth.on_update(lambda _: self.size_frusta())
 
-    def switch(self, word: str, *handles: viser.SceneNodeHandle | None) -> None:
+    def add_checkbox(self, word: str, *handles: viser.SceneNodeHandle | None) -> None:
         """A checkbox that shows and hides scene nodes; none where there is nothing to show."""
         present = [handle for handle in handles if handle is not None]
         if not present:
@@ -138,20 +138,20 @@ class Page:
 
     def show_photos(self) -> None:
         with self.server.atomic():
-            for frustum, handle in self.pyramids:
+            for frustum, handle in self.frusta:
                 handle.image = frustum.photo if self.photos.value else None
 
     def size_frusta(self) -> None:
         with self.server.atomic():
-            for frustum, handle in self.pyramids:
+            for frustum, handle in self.frusta:
                 handle.scale = viser_scale(frustum, self.depth.value * self.scale)
 
-    def lines(self, name: str, segments: np.ndarray, colour: tuple[int, int, int]) -> None:
+    def draw_lines(self, name: str, segments: np.ndarray, colour: tuple[int, int, int]) -> None:
         """Line segments [N, 2, 3] under a name, in place of what it had."""
         if not len(segments):
             self.server.scene.remove_by_name(name)
             return
-        self.server.scene.add_line_segments(name, segments, colour, thickness=LINE, thickness_units="screen")
+        self.server.scene.add_line_segments(name, segments, colour, thickness=LINE_WIDTH, thickness_units="screen")
 
     def points(self, name: str, points: np.ndarray, colour: tuple[int, int, int] | np.ndarray, size: float) -> None:
         """Points [N, 3] under a name, in place of what it had, of one colour or [N, 3]; `size` is a share of the scene's
@@ -178,6 +178,6 @@ def look_from(client: viser.ClientHandle, viewpoint: Viewpoint) -> None:
         client.camera.fov = viewpoint.fov
 
 
-def _hushed() -> contextlib.AbstractContextManager[object]:
+def _silence_stdout() -> contextlib.AbstractContextManager[object]:
     """Viser always announces its start and stop; the command prints a line of its own."""
     return contextlib.redirect_stdout(io.StringIO())

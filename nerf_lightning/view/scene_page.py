@@ -3,15 +3,15 @@
 import torch
 
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.drawing.ink import GREEN, GREY, MAUVE, SKY, VERMILLION, rgb
-from nerf_lightning.view.drawing import (
-    box_edges,
+from nerf_lightning.drawing.style import GREEN, GREY, MAUVE, SKY, VERMILLION, parse_hex_colour
+from nerf_lightning.view.geometry import (
+    build_ray_figure,
     colour_points,
-    home_of,
-    overview,
-    path_segments,
-    random_rays,
-    ray_figure,
+    compute_box_edges,
+    compute_path_segments,
+    get_home_viewpoint,
+    get_overview_viewpoint,
+    sample_random_rays,
 )
 from nerf_lightning.view.page import Page
 
@@ -25,25 +25,25 @@ class ScenePage(Page):
     """
 
     def __init__(self, scene: Scene, host: str, port: int):
-        _, distance = home_of(scene.orbit)
-        super().__init__(scene.name, overview(scene), distance, host, port)
+        _, distance = get_home_viewpoint(scene.orbit)
+        super().__init__(scene.name, get_overview_viewpoint(scene), distance, host, port)
         self.scene = scene
         self.seed = 0
         """Of the random pixels."""
         with self.server.atomic():
-            self.set_stage()
+            self.set_up_scene()
             self.add_cameras(scene)
-            self._add_surroundings()
+            self._add_geometry()
             self._add_controls()
             self.draw_rays()
 
-    def _add_surroundings(self) -> None:
+    def _add_geometry(self) -> None:
         scene = self.server.scene
         if self.scene.points is not None:
             self.points("/points", *colour_points(self.scene.points, self.scene.train), 0.006)
-        self.lines("/orbit", path_segments(self.scene.orbit), rgb(MAUVE))
-        self.lines("/box", box_edges(self.scene.bounds.aabb), rgb(GREY))
-        self.points("/focus", self.home.look_at[None], rgb(VERMILLION), 0.02)
+        self.draw_lines("/orbit", compute_path_segments(self.scene.orbit), parse_hex_colour(MAUVE))
+        self.draw_lines("/box", compute_box_edges(self.scene.bounds.aabb), parse_hex_colour(GREY))
+        self.points("/focus", self.home.look_at[None], parse_hex_colour(VERMILLION), 0.02)
         scene.add_frame("/axes", axes_length=0.2 * self.scale, axes_radius=0.003 * self.scale)
         self.ray_group = scene.add_frame("/rays", show_axes=False)
 
@@ -57,8 +57,8 @@ class ScenePage(Page):
         gui.add_button("whole scene").on_click(self.go_home)
         with gui.add_folder("show"):
             for word in ("points", "orbit", "box", "axes"):
-                self.switch(word, self.server.scene.get_handle_by_name(f"/{word}"))
-            self.add_camera_switches()
+                self.add_checkbox(word, self.server.scene.get_handle_by_name(f"/{word}"))
+            self.add_camera_checkboxes()
         with gui.add_folder("rays", expand_by_default=False):
             self.rays = gui.add_slider("rays", 0, 64, 1, 0, hint="from each training camera")
             self.samples = gui.add_slider("samples", 1, 256, 1, 64, hint="on each ray")
@@ -69,15 +69,15 @@ class ScenePage(Page):
 
     def draw_rays(self, again: bool = False) -> None:
         """Draws the rays that the controls ask for; the same pixels as before unless `again`."""
-        with self.redrawing, self.server.atomic():
+        with self.draw_lock, self.server.atomic():
             self.seed += again
             self.ray_group.visible = self.rays.value > 0
             if not self.ray_group.visible:
                 return
             cameras = self.scene.train.cameras
             views = torch.arange(len(cameras)).repeat_interleave(self.rays.value)
-            rays = random_rays(cameras, views, torch.Generator().manual_seed(self.seed))
-            figure = ray_figure(rays, self.scene.bounds, self.samples.value, self.scale)
-            self.lines("/rays/approach", figure.approach, rgb(SKY))
-            self.lines("/rays/inside", figure.inside, rgb(GREEN))
-            self.points("/rays/samples", figure.samples, rgb(VERMILLION), 0.006)
+            rays = sample_random_rays(cameras, views, torch.Generator().manual_seed(self.seed))
+            figure = build_ray_figure(rays, self.scene.bounds, self.samples.value, self.scale)
+            self.draw_lines("/rays/approach", figure.approach, parse_hex_colour(SKY))
+            self.draw_lines("/rays/inside", figure.inside, parse_hex_colour(GREEN))
+            self.points("/rays/samples", figure.samples, parse_hex_colour(VERMILLION), 0.006)

@@ -3,12 +3,12 @@
 import socket
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.libraries import require
+from nerf_lightning.utils.libraries import require_extra
 
 
 def require_viser() -> None:
     """Raises InputError where Viser, an optional extra, is not installed."""
-    require("view", "viser", purpose="the viewer's optional extra")
+    require_extra("view", "viser", purpose="the viewer's optional extra")
 
 
 def resolve_host(host: str) -> str:
@@ -23,9 +23,9 @@ def resolve_host(host: str) -> str:
         with socket.create_server((host, 0)) as server:
             return server.getsockname()[0]
     except OSError as error:
-        todo = "127.0.0.1 for this machine alone, 0.0.0.0 to share the page with the network"
+        hint = "127.0.0.1 for this machine alone, 0.0.0.0 to share the page with the network"
         found = f"{host!r} ({error.strerror or error})"
-        raise InputError("view", "host", found, "an address of this machine", todo) from error
+        raise InputError("view", "host", found, "an address of this machine", hint) from error
 
 
 def announce(name: str, host: str, wanted: int, port: int) -> str:

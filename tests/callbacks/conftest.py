@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from nerf_lightning.dataset import Picture, PixelDataModule
-from nerf_lightning.dataset.subset import WHOLE, PixelSubset
+from nerf_lightning.dataset.pixel_subset import ALL_PIXELS, PixelSubset
 from nerf_lightning.model import PictureField
 from nerf_lightning.system import NeRF2D, StepStats, ViewResult, constant
 
@@ -34,50 +34,50 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return clock
 
 
-class Grey(PictureField):
+class GrayField(PictureField):
     def __init__(self):
         super().__init__((16, 12))
-        self.level = torch.nn.Parameter(torch.tensor(0.5))
+        self.gray = torch.nn.Parameter(torch.tensor(0.5))
 
     def forward(self, uv: torch.Tensor) -> torch.Tensor:
-        return self.level.expand(len(uv), 3)
+        return self.gray.expand(len(uv), 3)
 
 
-class Scripted(NeRF2D):
+class ScriptedSystem(NeRF2D):
     """Measures what it is told, and notes what it was asked."""
 
     def __init__(self):
-        super().__init__(Grey(), functools.partial(torch.optim.SGD, lr=0.1), constant)
+        super().__init__(GrayField(), functools.partial(torch.optim.SGD, lr=0.1), constant)
         self.psnrs = iter(range(10, 1000))
-        self.asked: list[Any] = []
+        self.evaluated: list[Any] = []
         mse = torch.tensor(0.01, dtype=torch.float64)
         self.stats = StepStats(mse, 30, 90, losses={"photometric": mse})
 
     def evaluate(self, view: Any) -> ViewResult:
-        self.asked.append(view)
+        self.evaluated.append(view)
         time.perf_counter.wait(50)  # slow, which must not count
         picture = torch.rand(12, 16, 3)
         return ViewResult(picture, picture, float(next(self.psnrs)), 50.0)
 
 
 @pytest.fixture
-def system() -> Scripted:
-    return Scripted()
+def system() -> ScriptedSystem:
+    return ScriptedSystem()
 
 
 class Data(PixelDataModule):
-    held_out_views = 10
+    num_held_out_views = 10
 
     def __init__(self, scene: Picture):
         super().__init__(scene)
         self.subsets: list[PixelSubset] = []
         """What was asked of each view."""
 
-    def held_out(self, view: int, subset: PixelSubset = WHOLE) -> int:
+    def get_held_out_view(self, view: int, subset: PixelSubset = ALL_PIXELS) -> int:
         self.subsets.append(subset)
         return view
 
-    def pixels_held_out(self, view: int) -> int:
+    def count_held_out_pixels(self, view: int) -> int:
         return 12 * 16
 
 

@@ -4,7 +4,7 @@ from nerf_lightning.callbacks import Budget
 from nerf_lightning.errors import InputError
 
 
-def test_budget_paused_clock_stands(clock, system, trainer_with):
+def test_budget_paused_clock_does_not_advance(clock, system, trainer_with):
     budget = Budget(seconds=100)
     trainer = trainer_with(budget)
     clock.wait(7)
@@ -12,21 +12,21 @@ def test_budget_paused_clock_stands(clock, system, trainer_with):
     budget.on_train_start(trainer, system)
     clock.wait(10)
     assert budget.seconds == 10
-    with budget.paused():
+    with budget.pause():
         clock.wait(1000)
         assert budget.seconds == 10
-        with budget.paused():
+        with budget.pause():
             clock.wait(1000)
         clock.wait(1000)
         assert budget.seconds == 10, "the inner pause does not start the clock"
-    with pytest.raises(ZeroDivisionError), budget.paused():
+    with pytest.raises(ZeroDivisionError), budget.pause():
         clock.wait(1000)
         raise ZeroDivisionError
     clock.wait(6)
     assert budget.seconds == 16, "runs again after an error"
     budget.on_train_end(trainer, system)
     clock.wait(1000)
-    with budget.paused():
+    with budget.pause():
         clock.wait(1000)
     clock.wait(1000)
     assert budget.seconds == 16, "a pause after the end does not start it"
@@ -43,17 +43,19 @@ def test_budget_paused_clock_stands(clock, system, trainer_with):
         (200, None, 0, 0, 0, None, 30),
     ],
 )
-def test_budget_of_two_limits_follows_nearer(
+def test_budget_two_limits_follow_nearer_one(
     steps, seconds, step, spent, progress, left, rendering, clock, system, trainer_with
 ):
     budget = Budget(steps, seconds)
     budget.on_train_start(trainer_with(budget), system)
     clock.wait(spent)
     assert budget.progress(step) == progress and budget.seconds_left(step) == pytest.approx(left)
-    assert budget.render_seconds(step) == pytest.approx(rendering), "as long as training, and at least half a minute"
+    assert budget.render_allowance_seconds(step) == pytest.approx(rendering), (
+        "as long as training, and at least half a minute"
+    )
 
 
-def test_budget_spent_stops_training(clock, system, trainer_with):
+def test_budget_exhausted_stops_training(clock, system, trainer_with):
     budget = Budget(steps=3, seconds=100)
     trainer = trainer_with(budget)
     budget.on_train_start(trainer, system)
@@ -67,7 +69,7 @@ def test_budget_spent_stops_training(clock, system, trainer_with):
     assert trainer.should_stop
 
 
-def test_budget_resumed_continues_where_it_stopped(clock, system, trainer_with):
+def test_budget_resumed_continues_clock(clock, system, trainer_with):
     first, second = Budget(seconds=20), Budget(seconds=20)
     first.on_train_start(trainer_with(first), system)
     clock.wait(15)
@@ -83,6 +85,6 @@ def test_budget_resumed_continues_where_it_stopped(clock, system, trainer_with):
     assert trainer.should_stop, "a finished run has nothing left"
 
 
-def test_budget_without_limit_is_refused():
+def test_budget_without_limit_raises():
     with pytest.raises(InputError, match="budget"):
         Budget()

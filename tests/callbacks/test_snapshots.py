@@ -5,11 +5,11 @@ from nerf_lightning.errors import InputError
 
 
 @pytest.mark.parametrize(("steps", "expected"), [(None, [10, 20, 50, 100]), ([1, 7, 200], [1, 7]), ([], [])])
-def test_snapshots_steps_are_those_given_or_1_2_5(steps, expected):
-    assert Snapshots(steps=steps).steps_until(150) == expected
+def test_list_snapshot_steps_default_is_1_2_5(steps, expected):
+    assert Snapshots(steps=steps).list_snapshot_steps(150) == expected
 
 
-def test_snapshots_are_written_when_due_with_clock_stopped(clock, system, trainer_with, tmp_path):
+def test_snapshots_due_steps_are_written_with_clock_stopped(clock, system, trainer_with, tmp_path):
     budget, snapshots = Budget(steps=9), Snapshots(steps=[2, 4], view=3)
     trainer = trainer_with(budget, snapshots)
     budget.on_train_start(trainer, system)
@@ -19,12 +19,12 @@ def test_snapshots_are_written_when_due_with_clock_stopped(clock, system, traine
     snapshots.on_train_end(trainer, system)
     names = sorted(path.name for path in (tmp_path / "snapshots").iterdir())
     assert names == ["step_0000002.png", "step_0000004.png", "step_0000005.png"]
-    assert system.asked == [0, 3, 3, 3] and budget.seconds == 5
+    assert system.evaluated == [0, 3, 3, 3] and budget.seconds == 5
     snapshots.on_train_end(trainer, system)
-    assert len(system.asked) == 4, "what is there already is not taken again"
+    assert len(system.evaluated) == 4, "what is there already is not taken again"
 
 
 @pytest.mark.parametrize("view", [-1, 10])
-def test_snapshots_missing_view_is_refused(view, trainer_with):
+def test_snapshots_missing_view_raises(view, trainer_with):
     with pytest.raises(InputError, match="callbacks.snapshots.view"):
         Snapshots(view=view).check(trainer_with().datamodule)

@@ -3,14 +3,14 @@ import pytest
 from nerf_lightning.callbacks import Budget, Throughput
 
 
-def test_throughput_speeds_are_averages_since_last_entry(clock, system, trainer_with):
+def test_throughput_speeds_average_since_last_entry(clock, system, trainer_with):
     budget, throughput = Budget(steps=100), Throughput(every=4)
     trainer = trainer_with(budget, throughput)
     budget.on_train_start(trainer, system)
     throughput.on_train_start(trainer, system)
     for trainer.global_step in range(1, 9):
         clock.wait(1 if trainer.global_step <= 4 else 3)
-        with budget.paused():
+        with budget.pause():
             clock.wait(100)
         throughput.on_train_batch_end(trainer, system, None, None, 0)
     (first, at_first), (second, at_second) = (call.args for call in trainer.logger.log_metrics.call_args_list)

@@ -8,7 +8,7 @@ from nerf_lightning.cameras.bounds import unwarp, warp
 BOX = torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]])
 
 
-def some_rays(count: int) -> Rays:
+def sample_random_rays(count: int) -> Rays:
     origins = torch.randn(count, 3) * 3
     toward = BOX.mean(0) + torch.randn(count, 3)
     return Rays(origins, torch.nn.functional.normalize(toward - origins, dim=-1))
@@ -16,16 +16,16 @@ def some_rays(count: int) -> Rays:
 
 AXES = torch.cat([torch.eye(3), -torch.eye(3)])
 RAYS = {
-    "random": lambda: some_rays(200),
+    "random": lambda: sample_random_rays(200),
     "parallel to an axis, through": lambda: Rays(BOX.mean(0) - 4 * AXES, AXES),
     "parallel to an axis, beside": lambda: Rays(BOX[1] + 0.1 - 4 * AXES, AXES),
-    "inside": lambda: Rays(BOX[0] + torch.rand(100, 3) * (BOX[1] - BOX[0]), some_rays(100).directions),
-    "leaving": lambda: Rays(BOX[1] + 0.1 + torch.rand(50, 3), some_rays(50).directions.abs()),
+    "inside": lambda: Rays(BOX[0] + torch.rand(100, 3) * (BOX[1] - BOX[0]), sample_random_rays(100).directions),
+    "leaving": lambda: Rays(BOX[1] + 0.1 + torch.rand(50, 3), sample_random_rays(50).directions.abs()),
 }
 
 
 @pytest.mark.parametrize("kind", RAYS)
-def test_near_far_agrees_with_marching(kind):
+def test_near_far_of_random_rays_agrees_with_marching(kind):
     rays = RAYS[kind]()
     near, far = Bounds(BOX).near_far(rays)
     assert near.isfinite().all() and far.isfinite().all()
@@ -47,7 +47,7 @@ def test_near_far_agrees_with_marching(kind):
 
 
 @pytest.mark.parametrize(("unbounded", "reach"), [(False, 1.1), (True, 0.9), (True, 20.0)])
-def test_to_world_inverts_to_unit_cube(unbounded, reach):
+def test_to_world_of_unit_positions_inverts_to_unit(unbounded, reach):
     bounds = Bounds(BOX.double(), unbounded)
     world = bounds.centre + reach * bounds.half_size * torch.rand(500, 3).double().mul(2).sub(1)
     torch.testing.assert_close(bounds.to_world(bounds.to_unit(world)), world)
@@ -55,7 +55,7 @@ def test_to_world_inverts_to_unit_cube(unbounded, reach):
     torch.testing.assert_close(bounds.to_unit(bounds.to_world(unit)), unit)
 
 
-def test_to_unit_unbounded_contracts():
+def test_to_unit_unbounded_contracts_outside_positions():
     torch.testing.assert_close(Bounds(BOX).to_unit(BOX), torch.tensor([[0.0, 0, 0], [1, 1, 1]]))
     bounds = Bounds(BOX, unbounded=True)
     torch.testing.assert_close(bounds.to_unit(BOX), torch.tensor([[0.25] * 3, [0.75] * 3]))
@@ -67,34 +67,36 @@ def test_to_unit_unbounded_contracts():
     assert bounds.to_world(torch.tensor([[0.0, 1.0, 0.5], [1.0, 1.0, 1.0]])).isfinite().all()
 
 
-def test_near_far_overrides_narrow_and_unbounded_reaches_far():
+def test_near_far_with_overrides_narrows_and_unbounded_extends():
     rays = RAYS["inside"]()
     _, exit = Bounds(BOX).near_far(rays)
     start, end = Bounds(BOX, near=0.5, far=2.0).near_far(rays)
     torch.testing.assert_close(start, torch.full_like(start, 0.5))
     torch.testing.assert_close(end, exit.clamp(max=2.0))
-    near, far = Bounds(BOX, unbounded=True).near_far(some_rays(4))
+    near, far = Bounds(BOX, unbounded=True).near_far(sample_random_rays(4))
     torch.testing.assert_close(near, torch.full((4,), 0.02 * 1.25))
     torch.testing.assert_close(far, torch.full((4,), 50 * 1.25))
 
 
-def along_x(*starts: list[float]) -> Rays:
+def rays_along_x(*starts: list[float]) -> Rays:
     return Rays(torch.tensor(starts), torch.tensor([[1.0, 0.0, 0.0]]).expand(len(starts), -1))
 
 
-def test_distances_unbounded_steps_grow_outside_the_box():
+def test_s_to_t_unbounded_steps_grow_outside_the_box():
     """A cube of half-size 2, met, begun inside of, missed, and far behind: by hand."""
     cube = Bounds(torch.tensor([[-2.0, -2, -2], [2, 2, 2]]), unbounded=True)
-    rays = along_x([-8.0, 0, 0], [1.0, 0, 0], [-8.0, 5, 0], [30.0, 0, 0])
-    torch.testing.assert_close(cube.inside(rays), torch.tensor([[6.0, 10.0], [-3.0, 1.0], [8.0, 8.0], [-32.0, -28.0]]))
+    rays = rays_along_x([-8.0, 0, 0], [1.0, 0, 0], [-8.0, 5, 0], [30.0, 0, 0])
+    torch.testing.assert_close(
+        cube.content_interval(rays), torch.tensor([[6.0, 10.0], [-3.0, 1.0], [8.0, 8.0], [-32.0, -28.0]])
+    )
     # Six before the box are three half-sizes, 3 / 4 of all there is before; then two in it; ten behind it are 5 / 6.
     even = torch.tensor([[-3 / 4, 0.0, 1.0, 2.0, 2 + 1 / 2, 2 + 5 / 6]])
     t = torch.tensor([[0.0, 6.0, 8.0, 10.0, 12.0, 20.0]])
-    inside, unit = cube.inside(rays), 2.0
+    inside, unit = cube.content_interval(rays), 2.0
     torch.testing.assert_close(warp(t, inside[:1], unit), even)
     torch.testing.assert_close(unwarp(even, inside[:1], unit), t)
     near, far = torch.zeros(4), torch.full((4,), 40.0)
-    edges = cube.distances(rays, near, far, torch.linspace(0, 1, 401).expand(4, -1))
+    edges = cube.s_to_t(rays, near, far, torch.linspace(0, 1, 401).expand(4, -1))
     steps = edges.diff(dim=1)
     t = edges[:, :-1] + steps / 2
     beyond = torch.stack([inside[:, :1] - t, t - inside[:, 1:]]).amax(0).clamp_min(0) / 2

@@ -20,13 +20,13 @@ MODELS = {
 STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
 
 
-def cameras_with(name: str) -> Cameras:
+def make_lens_cameras(name: str) -> Cameras:
     distortion, projection = MODELS[name]
     lenses = Lenses(torch.tensor([distortion]), torch.tensor([projection]))
     return Cameras(torch.from_numpy(K).float()[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lenses)
 
 
-def opencv(name: str, row: torch.Tensor, col: torch.Tensor) -> np.ndarray:
+def opencv_distortion(name: str, row: torch.Tensor, col: torch.Tensor) -> np.ndarray:
     """Directions by OpenCV, whose pixel centres are at integers."""
     d, projection = MODELS[name]
     seen = torch.stack([col, row], dim=1).double().numpy()[:, None]
@@ -40,31 +40,31 @@ def opencv(name: str, row: torch.Tensor, col: torch.Tensor) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_rays_distorted_agree_with_opencv_and_project(name: str):
+def test_generate_rays_distorted_agree_with_opencv_and_project(name: str):
     row, col = torch.randint(HEIGHT, (5000,)), torch.randint(WIDTH, (5000,))
-    rays = cameras_with(name).rays(torch.zeros_like(row), row, col).directions.double().numpy()
-    expected = opencv(name, row, col)
+    rays = make_lens_cameras(name).generate_rays(torch.zeros_like(row), row, col).directions.double().numpy()
+    expected = opencv_directions(name, row, col)
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     angle = np.linalg.norm(np.cross(rays, expected), axis=1)
     assert (np.sum(rays * expected, axis=1) > 0).all() and angle.max() < 1e-5
     points = torch.from_numpy(rays).float() * torch.linspace(0.5, 9, len(rays))[:, None]
-    pixels, depth, inside = cameras_with(name).project(points, 0)
+    pixels, depth, inside = make_lens_cameras(name).project(points, 0)
     torch.testing.assert_close(pixels, torch.stack([col, row], dim=1) + 0.5, atol=2e-3, rtol=0)
     assert inside.all() and (depth > 0).all()
 
 
-def test_project_fisheye_sees_behind():
+def test_project_fisheye_shows_points_at_more_than_90_degrees():
     lens = Lenses(torch.tensor([Distortion(k1=0.01)]), torch.tensor([FISHEYE]))
     wide = torch.tensor([[[200.0, 0, 322], [0, 200, 237], [0, 0, 1]]])
     cameras = Cameras(wide, torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lens)
-    rays = cameras.view_rays(0)
+    rays = cameras.generate_view_rays(0)
     assert float(rays.directions[:, 2].min()) < -0.1
     pixels, _, inside = cameras.project(3 * rays.directions[::997], 0)
     assert inside.all()
     torch.testing.assert_close(pixels[1], torch.tensor([997 % WIDTH + 0.5, 997 // WIDTH + 0.5]), atol=5e-3, rtol=0)
 
 
-def test_project_beyond_the_rim_is_unseen():
+def test_project_beyond_visible_radius_is_outside():
     # This polynomial leads back into the picture from far outside.
     lens = Lenses(torch.tensor([Distortion(k1=-0.2)]), torch.tensor([PERSPECTIVE]))
     cameras = Cameras(torch.from_numpy(K).float()[None], torch.eye(4)[None], torch.tensor([[WIDTH, HEIGHT]]), lens)

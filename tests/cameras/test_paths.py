@@ -6,14 +6,14 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerf_lightning.cameras import Cameras, orbit_like, pivot_of, spiral_like
+from nerf_lightning.cameras import Cameras, find_pivot, make_orbit_path, make_spiral_path
 from nerf_lightning.dataset.region import find_region
-from tests.helpers.camera_paths import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring, walk
+from tests.helpers.camera_paths import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring_poses, walk
 
-CAPTURES = {
-    "ring": ring(),
-    "framed to one side": ring(yaw=20),
-    "arc": ring(degrees=150),
+LAYOUT_POSES = {
+    "ring": ring_poses(),
+    "framed to one side": ring_poses(yaw=20),
+    "arc": ring_poses(degrees=150),
     "dome": dome(),
     "converging": forward(-0.3),
     "diverging": forward(0.2),
@@ -21,69 +21,69 @@ CAPTURES = {
     "half a pan": pan(degrees=150),
     "walk": walk(),
     "corridor": corridor(),
-    "one": ring(1),
-    "two": ring(2),
-    "all in one pose": ring(1).repeat(5, 1, 1),
+    "one": ring_poses(1),
+    "two": ring_poses(2),
+    "all in one pose": ring_poses(1).repeat(5, 1, 1),
 }
 
 
-def cameras_at(c2w: torch.Tensor) -> Cameras:
-    return Cameras.of_size(torch.eye(3).repeat(len(c2w), 1, 1) * 20, c2w.float(), 32, 24)
+def make_cameras(c2w: torch.Tensor) -> Cameras:
+    return Cameras.pinhole(torch.eye(3).repeat(len(c2w), 1, 1) * 20, c2w.float(), 32, 24)
 
 
-def orbit_at(c2w: torch.Tensor, frames: int) -> Cameras:
+def make_orbit(c2w: torch.Tensor, frames: int) -> Cameras:
     region = find_region(c2w)
-    return orbit_like(cameras_at(c2w), region.layout, region.centre, frames)
+    return make_orbit_path(make_cameras(c2w), region.layout, region.centre, frames)
 
 
 @pytest.mark.parametrize("frames", [1, 60])
-@pytest.mark.parametrize("c2w", CAPTURES.values(), ids=CAPTURES.keys())
-def test_orbit_like_and_spiral_stay_near_the_photos(c2w: torch.Tensor, frames: int):
-    cameras = cameras_at(c2w)
-    orbit = orbit_at(c2w, frames)
-    spiral = spiral_like(orbit, frames)
+@pytest.mark.parametrize("c2w", LAYOUT_POSES.values(), ids=LAYOUT_POSES.keys())
+def test_make_orbit_path_and_spiral_stay_near_the_photos(c2w: torch.Tensor, frames: int):
+    cameras = make_cameras(c2w)
+    orbit = make_orbit(c2w, frames)
+    spiral = make_spiral_path(orbit, frames)
     for path in (orbit, spiral):
         assert len(path) == frames
         R = path.c2w[:, :3, :3]
         torch.testing.assert_close(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-4, rtol=0)
         assert (torch.linalg.det(R) > 0).all() and path.c2w.isfinite().all()
         assert (path.c2w[:, :3, 1] @ UP.float()).max() < 0.1, "upright"
-    apart = torch.cdist(orbit.centres, cameras.centres)
+    distances = torch.cdist(orbit.centres, cameras.centres)
     spacing = torch.cdist(cameras.centres, cameras.centres).fill_diagonal_(math.inf).amin(1)
     size = float((cameras.centres - cameras.centres.mean(0)).norm(dim=1).max())
     limit = max(0.35 * size, float(spacing[spacing < math.inf].max()) if len(c2w) > 1 else 0.0)
-    assert float(apart.amin(1).max()) <= limit + 1e-3, "no view far from all photos"
+    assert float(distances.amin(1).max()) <= limit + 1e-3, "no view far from all photos"
     # Each view looks within 45 degrees of a photo's direction.
     assert (orbit.c2w[:, :3, 2] @ cameras.c2w[:, :3, 2].T).amax(1).min() > 0.7
     if frames == 60:
         step = (orbit.centres.roll(-1, 0) - orbit.centres).norm(dim=1)
         assert float(step.max()) < 0.25 * max(size, 1e-3), "no jump, from the last to the first neither"
-    pivot = pivot_of(orbit)
+    pivot = find_pivot(orbit)
     assert pivot.isfinite().all() and float((pivot - orbit.centres[0]).norm()) > 1e-3
 
 
 @pytest.mark.parametrize("yaw", [0, 20])
-def test_orbit_like_ring_is_a_full_turn(yaw: int):
-    orbit = orbit_at(ring(yaw=yaw), 8)
-    assert (orbit.width, orbit.height) == (32, 24) and torch.equal(orbit.K, cameras_at(ring()).K[:8])
+def test_make_orbit_path_of_ring_is_a_full_turn(yaw: int):
+    orbit = make_orbit(ring_poses(yaw=yaw), 8)
+    assert (orbit.width, orbit.height) == (32, 24) and torch.equal(orbit.K, make_cameras(ring_poses()).K[:8])
     offset = orbit.centres - CENTRE.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((8,), RADIUS), atol=0.05, rtol=0)
     torch.testing.assert_close(orbit.c2w[:, :3, 2], -normalize(offset, dim=1), atol=0.05, rtol=0)
     turn = torch.atan2(offset[:, 1], offset[:, 0])
     steps = torch.remainder(turn.roll(-1) - turn, 2 * math.pi)
     torch.testing.assert_close(steps, torch.full((8,), math.pi / 4), atol=0.05, rtol=0)
-    torch.testing.assert_close(pivot_of(orbit), CENTRE.float(), atol=0.05, rtol=0)
+    torch.testing.assert_close(find_pivot(orbit), CENTRE.float(), atol=0.05, rtol=0)
 
 
-def test_orbit_like_photos_on_their_side_get_an_upright_view_of_their_shape():
+def test_make_orbit_path_of_portrait_photos_is_upright_and_portrait():
     quarter = torch.eye(4, dtype=torch.float64)[[1, 0, 2, 3]] * torch.tensor([1.0, -1, 1, 1])
-    orbit = orbit_at(ring() @ quarter, 8)
+    orbit = make_orbit(ring_poses() @ quarter, 8)
     assert (orbit.width, orbit.height) == (24, 32)
     assert (orbit.c2w[:, :3, 1] @ UP.float()).max() < -0.5, "upright"
 
 
-def test_orbit_like_arc_and_half_pan_swing():
-    arc, pans = orbit_at(ring(24, degrees=150), 60), orbit_at(pan(degrees=150), 60)
+def test_make_orbit_path_of_arc_and_half_pan_swings():
+    arc, pans = make_orbit(ring_poses(24, degrees=150), 60), make_orbit(pan(degrees=150), 60)
     offset = arc.centres - CENTRE.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.02, rtol=0)
     assert float((pans.centres - CENTRE.float()).abs().max()) < 1e-6
@@ -93,9 +93,9 @@ def test_orbit_like_arc_and_half_pan_swing():
 
 
 @pytest.mark.parametrize(("degrees", "outermost", "innermost"), [(150, 50, 25), (360, 60, 25)])
-def test_spiral_like_winds_in(degrees: float, outermost: float, innermost: float):
-    orbit = orbit_at(ring(24, degrees=degrees), 60)
-    offset = spiral_like(orbit, 60).centres - CENTRE.float()
+def test_make_spiral_path_of_ring_winds_in(degrees: float, outermost: float, innermost: float):
+    orbit = make_orbit(ring_poses(24, degrees=degrees), 60)
+    offset = make_spiral_path(orbit, 60).centres - CENTRE.float()
     middle = normalize(orbit.centres.mean(0) - CENTRE.float(), dim=0)
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.05, rtol=0)
     away = torch.acos(normalize(offset, dim=1) @ middle).rad2deg()

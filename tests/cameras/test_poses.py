@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerf_lightning.cameras import find_up, look_at, orbit_around
+from nerf_lightning.cameras import estimate_up, look_at, make_circle_poses
 
 UPS = [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (0.6, 0.0, 0.8), (0.36, 0.48, -0.8)]
 
@@ -14,7 +14,7 @@ def unit(*values: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(("batch", "up"), [((), UPS[1]), ((2, 3), UPS[3])])
-def test_look_at_points_at_the_target(batch, up):
+def test_look_at_of_target_points_forward_axis_at_it(batch, up):
     up, target = unit(*up), torch.randn(3).double()
     eye = target + 4 * torch.randn(*batch, 3).double()
     c2w = look_at(eye, target, up)
@@ -32,9 +32,9 @@ def test_look_at_points_at_the_target(batch, up):
 
 
 @pytest.mark.parametrize(("up", "elevation"), [(UPS[0], -0.4), (UPS[3], 1.3)])
-def test_orbit_around_is_a_level_circle(up, elevation):
+def test_make_circle_poses_is_a_level_circle(up, elevation):
     up, centre, radius, frames = unit(*up), torch.randn(3).double(), 2.5, 7
-    c2w = orbit_around(centre, up, radius, elevation, frames)
+    c2w = make_circle_poses(centre, up, radius, elevation, frames)
     offset = c2w[:, :3, 3] - centre
     assert c2w.shape == (frames, 4, 4)
     torch.testing.assert_close(offset.norm(dim=-1), torch.full((frames,), radius).double())
@@ -46,12 +46,12 @@ def test_orbit_around_is_a_level_circle(up, elevation):
     torch.testing.assert_close(angle, torch.full((frames,), 2 * math.pi / frames).double())  # the last one, too
 
 
-@pytest.mark.parametrize(("quarters", "share", "degrees"), [([0], 0.2, 15), ([1], 0.5, 5), ([0, 1, 0, 3, 0], 1, 2)])
-def test_find_up_any_side_of_photos(quarters: list[int], share: float, degrees: float):
+@pytest.mark.parametrize(("quarters", "fraction", "degrees"), [([0], 0.2, 15), ([1], 0.5, 5), ([0, 1, 0, 3, 0], 1, 2)])
+def test_estimate_up_of_rotated_photos_finds_up(quarters: list[int], fraction: float, degrees: float):
     """Cameras around a subject, held upright or on their side, and not quite level."""
     up = unit(0.3, 0.8, -0.5).float()
-    c2w = orbit_around(torch.tensor([0.4, -0.3, 0.2]), up, 2.0, 0.5, 40)[: int(share * 40)]
+    c2w = make_circle_poses(torch.tensor([0.4, -0.3, 0.2]), up, 2.0, 0.5, 40)[: int(fraction * 40)]
     angle = torch.tensor(quarters * 40)[: len(c2w)] * math.pi / 2 + 0.03 * torch.randn(len(c2w))
     roll = torch.eye(4).repeat(len(c2w), 1, 1)
     roll[:, 0, 0], roll[:, 0, 1], roll[:, 1, 0], roll[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
-    assert math.degrees(math.acos(float(find_up(c2w @ roll) @ up))) < degrees
+    assert math.degrees(math.acos(float(estimate_up(c2w @ roll) @ up))) < degrees

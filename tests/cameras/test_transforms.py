@@ -2,14 +2,14 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import pixel_to_camera, transform, transform_directions
+from nerf_lightning.cameras import pixel_to_camera, transform_directions, transform_points
 from tests.cameras.conftest import random_K, random_poses
 
 
 @pytest.mark.parametrize(("cameras", "points"), [((), ()), ((4, 1), (1, 3))])
-def test_transforms_are_homogeneous_products(cameras, points):
+def test_transform_points_and_directions_are_homogeneous_products(cameras, points):
     c2w, x = random_poses(*cameras), torch.randn(*points, 3, dtype=torch.float64)
-    for function, w in ((transform, 1.0), (transform_directions, 0.0)):
+    for function, w in ((transform_points, 1.0), (transform_directions, 0.0)):
         homogeneous = np.concatenate([x.numpy(), np.full((*points, 1), w)], -1)[..., None]
         np.testing.assert_allclose(function(c2w, x), np.matmul(c2w.numpy(), homogeneous)[..., :3, 0], atol=1e-12)
     K, uv, depth = random_K(*cameras), 300 * x[..., :2], 1 + torch.rand(points, dtype=torch.float64)

@@ -5,17 +5,17 @@ from pathlib import Path
 import pytest
 
 from benchmarks.synthetic.photos import Truth
-from nerf_lightning.capture.run import Capture, capture_scene
+from nerf_lightning.capture.pipeline import Capture, capture_scene
 from tests.helpers.shared_fixtures import make_once
-from tests.helpers.tag_views import SIZE
+from tests.helpers.tag_views import TAG_SIZE
 
 
 @pytest.fixture(scope="session")
-def packed(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
+def packed(tag_capture: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
     """What a capture of it writes, in a folder, and returns."""
 
     def make(folder: Path) -> tuple[Path, Capture]:
-        photos = made[0] / "calibration", made[0] / "photos"
-        return folder, capture_scene(*photos, SIZE, folder / "scene.npz", longest=200, holdout=4)
+        photos = tag_capture[0] / "calibration", tag_capture[0] / "photos"
+        return folder, capture_scene(*photos, TAG_SIZE, folder / "scene.npz", max_side=200, holdout=4)
 
     return make_once(tmp_path_factory, "packed", make)

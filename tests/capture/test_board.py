@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from nerf_lightning.capture.poses.calibrate import calibrate
-from nerf_lightning.capture.poses.geometry import angle_between, inverse, project
-from nerf_lightning.capture.tags.board import Board, board_detector
-from nerf_lightning.capture.tags.detect import Sighting
+from nerf_lightning.capture.poses.geometry import angle_between, invert_pose, project_points
+from nerf_lightning.capture.tags.board import Board, make_board_detector
+from nerf_lightning.capture.tags.detect import PhotoObservation
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.errors import InputError
-from tests.helpers.tag_views import camera
+from tests.helpers.tag_views import make_pose
 
 LENS = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
 BOARD, TAG, FAMILY = Board(5, 7, 0.03), 0.022, "DICT_4X4_50"
@@ -28,7 +28,7 @@ def printed(board: Board, legacy: bool = False) -> np.ndarray:
 
 def photo(print_: np.ndarray, board: Board, c2w: np.ndarray) -> np.ndarray:
     """The print as a camera sees it, x to the right and y up from its middle, without distortion."""
-    w2c = inverse(c2w)
+    w2c = invert_pose(c2w)
     height, width = print_.shape
     step = board.square / CELL
     to_world = np.array([[step, 0, -step * width / 2], [0, -step, step * height / 2], [0, 0, 1]])
@@ -45,36 +45,38 @@ def eyes(count: int) -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
     return [
-        camera([0.22 * np.cos(t), 0.22 * np.sin(t), 0.26 + 0.05 * rng.random()], [0, 0, 0], 0.3 * rng.standard_normal())
+        make_pose(
+            [0.22 * np.cos(t), 0.22 * np.sin(t), 0.26 + 0.05 * rng.random()], [0, 0, 0], 0.3 * rng.standard_normal()
+        )
         for t in turns
     ]
 
 
 @pytest.mark.parametrize("legacy", [False, True])
-def test_board_detector_finds_corners_where_they_project(legacy: bool):
+def test_make_board_detector_finds_corners_where_they_project(legacy: bool):
     board = Board(5, 6, 0.03)  # with an even number of rows old and new boards differ
-    detect = board_detector(FAMILY, TAG, board)
+    detect = make_board_detector(FAMILY, TAG, board)
     errors = []
     for c2w in eyes(8):
-        (mark,) = detect(photo(printed(board, legacy), board, c2w)).values()
-        assert len(mark.points) == 4 * 5 and not mark.points[:, 2].any()
-        errors.append(mark.pixels - project(LENS, inverse(c2w), mark.points))
+        (detection,) = detect(photo(printed(board, legacy), board, c2w)).values()
+        assert len(detection.points) == 4 * 5 and not detection.points[:, 2].any()
+        errors.append(detection.pixels - project_points(LENS, invert_pose(c2w), detection.points))
     flat = np.concatenate(errors)
     assert np.abs(flat).max() < 0.5 and np.abs(flat.mean(0)).max() < 0.1
 
 
 def test_calibrate_with_board_finds_lens_and_poses():
-    detect, c2ws = board_detector(FAMILY, TAG, BOARD), eyes(8)
+    detect, c2ws = make_board_detector(FAMILY, TAG, BOARD), eyes(8)
     photos = [photo(printed(BOARD), BOARD, c2w) for c2w in c2ws]
-    seen = [Sighting(Path(f"{i}.png"), LENS.width, LENS.height, detect(grey)) for i, grey in enumerate(photos)]
+    seen = [PhotoObservation(Path(f"{i}.png"), LENS.width, LENS.height, detect(grey)) for i, grey in enumerate(photos)]
     found = calibrate(Path("board"), seen, None)
     assert abs(found.lens.fx / LENS.fx - 1) < 0.003 and found.rms < 0.2
-    for w2c, c2w in zip(found.solved.w2c.values(), c2ws, strict=True):
-        assert angle_between(inverse(w2c), c2w) < np.radians(0.5)
+    for w2c, c2w in zip(found.solution.w2c.values(), c2ws, strict=True):
+        assert angle_between(invert_pose(w2c), c2w) < np.radians(0.5)
     assert detect(np.full((480, 640), 128, np.uint8)) == {}  # no board
 
 
-def test_board_of_impossible_size_raises():
+def test_make_board_detector_of_impossible_size_raises():
     for board, key in ((Board(5, 7, 0.02), "board_square"), (Board(12, 12, 0.03), "board_columns")):
         with pytest.raises(InputError, match=key):
-            board_detector(FAMILY, TAG, board)
+            make_board_detector(FAMILY, TAG, board)

@@ -6,15 +6,15 @@ import imageio.v3 as imageio
 import numpy as np
 import pytest
 
-from nerf_lightning.capture.poses.solve import PlacedPhoto
-from nerf_lightning.capture.report.contact_sheet import subsample_photos
-from nerf_lightning.capture.report.write import collect_residuals, write_report
-from nerf_lightning.capture.run import Capture
-from nerf_lightning.capture.tags.detect import Sighting
-from nerf_lightning.drawing.ink import magnification, readable, shortened
+from nerf_lightning.capture.pipeline import Capture
+from nerf_lightning.capture.poses.pose_solver import RegisteredPhoto
+from nerf_lightning.capture.report.report import collect_residuals, write_report
+from nerf_lightning.capture.report.tag_sheet import subsample_photos
+from nerf_lightning.capture.tags.detect import PhotoObservation
+from nerf_lightning.drawing.style import choose_magnification, replace_missing_glyphs, shorten
 
 
-def test_write_report_writes_three_pictures(packed: tuple[Path, Capture], tmp_path: Path):
+def test_write_report_of_capture_writes_three_images(packed: tuple[Path, Capture], tmp_path: Path):
     _, capture = packed
     files = write_report(capture, tmp_path / "report")
     assert [file.name for file in files] == ["tags.png", "errors.png", "cameras.png"]
@@ -27,9 +27,10 @@ def test_write_report_writes_three_pictures(packed: tuple[Path, Capture], tmp_pa
     assert np.sqrt((residuals**2).sum(1).mean()) == pytest.approx(capture.calibration.rms)
 
 
-def test_subsample_photos_keeps_those_left_out():
+def test_subsample_photos_of_many_keeps_excluded_ones():
     photos = [
-        PlacedPhoto(Sighting(Path("x.png"), 4, 3, {}), "blurred" if n in (17, 18, 120) else "") for n in range(200)
+        RegisteredPhoto(PhotoObservation(Path("x.png"), 4, 3, {}), "blurred" if n in (17, 18, 120) else "")
+        for n in range(200)
     ]
     assert subsample_photos(photos[:24], 24) == list(range(24))
     numbers = subsample_photos(photos, 24)
@@ -37,7 +38,7 @@ def test_subsample_photos_keeps_those_left_out():
     assert max(np.diff([n for n in numbers if n not in (17, 18, 120)])) <= 12
 
 
-def test_ink_magnification_takes_round_steps_and_names_stay_readable():
-    assert [magnification(1.0, target) for target in (0.5, 2.0, 4.9, 5.0, 99.0)] == [1, 2, 2, 5, 50]
-    assert readable("Grüße $1$ \u5bb6\n.png") == "Grüße $1$ ??.png"
-    assert shortened("abcdefghijk", 10) == "abcd…ghijk"
+def test_choose_magnification_takes_round_steps_and_text_fits_font():
+    assert [choose_magnification(1.0, target) for target in (0.5, 2.0, 4.9, 5.0, 99.0)] == [1, 2, 2, 5, 50]
+    assert replace_missing_glyphs("Grüße $1$ \u5bb6\n.png") == "Grüße $1$ ??.png"
+    assert shorten("abcdefghijk", 10) == "abcd…ghijk"

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.check.findings import judge_photos
-from nerf_lightning.check.quality import sharpness
+from nerf_lightning.check.photo_quality import sharpness
+from nerf_lightning.check.report import assess_photos
 from nerf_lightning.cli.check import check
 from nerf_lightning.dataset import Views, open_scene
-from nerf_lightning.drawing.camera_map import camera_map
-from nerf_lightning.synthetic.objects import PILE, place_cameras, render_photos
-from tests.helpers.colmap_files import cameras_of, photos, write_colmap
+from nerf_lightning.drawing.camera_map import plot_camera_map
+from nerf_lightning.synthetic.objects import PILE, make_hemisphere_cameras, render_photos
+from tests.helpers.scene_writers import colmap_cameras, write_colmap, write_photos
 
 Edit = Callable[[np.ndarray], np.ndarray]
 
@@ -23,37 +23,37 @@ Edit = Callable[[np.ndarray], np.ndarray]
 @pytest.fixture(scope="module")
 def views() -> Views:
     """A pile on grey grain."""
-    cameras = place_cameras(16, 96)
+    cameras = make_hemisphere_cameras(16, 96)
     images = render_photos(PILE, cameras, (0.5, 0.5, 0.5)).numpy().astype(np.int16)
     noise = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 60, (96, 96)), (0, 0), 1.0)
     grain = np.stack([np.roll(noise, 7 * i, axis=1) for i in range(16)])[..., None]
-    return Views.of(torch.from_numpy((images + grain).clip(0, 255).astype(np.uint8)), cameras)
+    return Views.from_images(torch.from_numpy((images + grain).clip(0, 255).astype(np.uint8)), cameras)
 
 
 def capture(folder: Path, views: Views, edits: dict[int, Edit], points: np.ndarray | None = None) -> Path:
-    names = photos(folder / "images", views)
+    names = write_photos(folder / "images", views)
     for i, edit in edits.items():
         imageio.imwrite(folder / "images" / names[i], edit(imageio.imread(folder / "images" / names[i])))
     given = {} if points is None else {"points": points}
-    write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views), **given)
+    write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, colmap_cameras(views), **given)
     return folder
 
 
-def troubles(folder: Path) -> dict[str, list[str]]:
-    found, _ = judge_photos(open_scene(str(folder)))
-    return {photo.name: [text.split(":")[0] for text in photo.troubles] for photo in found if photo.troubles}
+def issues(folder: Path) -> dict[str, list[str]]:
+    found, _ = assess_photos(open_scene(str(folder)))
+    return {photo.name: [text.split(":")[0] for text in photo.issues] for photo in found if photo.issues}
 
 
-def test_judge_photos_names_each_trouble(views: Views, tmp_path: Path):
+def test_assess_photos_of_damaged_photos_names_each_issue(views: Views, tmp_path: Path):
     edits: dict[int, Edit] = {
         2: lambda image: cv2.GaussianBlur(image, (0, 0), 1.2),
         5: lambda image: (image.astype(float) * 1.9).clip(0, 255).astype(np.uint8),
         7: lambda image: (image * 0.1).astype(np.uint8),
     }
-    assert troubles(capture(tmp_path / "good", views, {})) == {}
+    assert issues(capture(tmp_path / "good", views, {})) == {}
     folder = capture(tmp_path / "bad", views, edits)
     (folder / "images/0011.png").write_bytes((folder / "images/0010.png").read_bytes())
-    assert troubles(folder) == {
+    assert issues(folder) == {
         "0002.png": ["blurred"],
         "0005.png": ["over-exposed", "brighter than the others"],
         "0007.png": ["darker than the others"],
@@ -68,7 +68,7 @@ def test_sharpness_does_not_depend_on_exposure(views: Views):
     assert sharpness(cv2.GaussianBlur(image, (0, 0), 1.5)) < 0.7 * sharpness(image)
 
 
-def test_check_page_shows_everything_the_worst_first(views: Views, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_render_check_page_shows_photos_worst_first(views: Views, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     folder = capture(tmp_path / "a <b>", views, {9: lambda image: cv2.GaussianBlur(image, (0, 0), 1.5)})
     (folder / "images/9999.png").write_bytes((folder / "images/0000.png").read_bytes())
     page = tmp_path / "page.html"
@@ -85,9 +85,9 @@ def test_check_page_shows_everything_the_worst_first(views: Views, tmp_path: Pat
     assert all("data:image/jpeg" in figure for figure in figures)
 
 
-def test_camera_map_shows_points_and_box(views: Views, tmp_path: Path):
+def test_plot_camera_map_shows_points_and_box(views: Views, tmp_path: Path):
     scene = open_scene(str(capture(tmp_path, views, {}, np.random.default_rng(0).normal(0, 0.3, (300, 3)))))
-    figure = camera_map(list(enumerate(scene.train.cameras.c2w.double().numpy())), scene, {})
+    figure = plot_camera_map(list(enumerate(scene.train.cameras.c2w.double().numpy())), scene, {})
     assert scene.points is not None
     above, beside = figure.axes
     for axes, up in ((above, 1), (beside, 2)):

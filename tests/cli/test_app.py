@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning.cli.app import app, find_cause
+from nerf_lightning.cli.app import app, find_input_error
 
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = [name for name in app.resolved_commands() if not name.startswith("-")]
 
 
-def test_help_imports_nothing_heavy():
+def test_help_does_not_import_torch():
     probe = "import sys; from nerf_lightning.cli.app import app\n"
     probe += f"for name in {COMMANDS}: \n  app([name, '--help'])\n"
     probe += "print(sorted({'torch', 'lightning', 'cv2', 'hydra', 'pandas', 'scipy', 'numpy'} & set(sys.modules)))"
@@ -20,16 +20,16 @@ def test_help_imports_nothing_heavy():
     assert done.stdout.endswith("[]\n"), done.stdout[-200:] + done.stderr
 
 
-def test_help_of_each_command_fits_a_screen(inside, monkeypatch: pytest.MonkeyPatch):
+def test_help_of_each_command_fits_screen(run_cli, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("COLUMNS", "100")
     for name in COMMANDS:
-        code, out, err = inside(name, "--help")
+        code, out, err = run_cli(name, "--help")
         assert (code, err) == (0, "") and out.startswith(f"Usage: nerf_lightning {name}")
         assert len(out.splitlines()) <= 45
 
 
-def test_front_page_lists_commands_in_the_order_of_the_work_and_first_steps(inside):
-    code, out, _ = inside()
+def test_help_lists_commands_in_workflow_order_and_quick_start(run_cli):
+    code, out, _ = run_cli()
     assert code == 0 and "export mesh -o mesh.glb" in out
     places = [out.index(f" {name} ") for name in COMMANDS]
     assert places == sorted(places)
@@ -47,11 +47,11 @@ def test_front_page_lists_commands_in_the_order_of_the_work_and_first_steps(insi
         (["evaluate"], "outputs: found nothing there"),
     ],
 )
-def test_wrong_arguments_give_one_line_and_exit_code_2(arguments: list[str], words: str, inside):
-    code, _, err = inside(*arguments)
+def test_main_wrong_arguments_exit_with_code_2(arguments: list[str], words: str, run_cli):
+    code, _, err = run_cli(*arguments)
     assert code == 2 and err.count("\n") == 1 and words in err
 
 
-def test_torchvision_for_another_pytorch_says_how_to_mend_it():
-    found = find_cause(RuntimeError("operator torchvision::nms does not exist"))
+def test_find_input_error_mismatched_torchvision_gives_hint():
+    found = find_input_error(RuntimeError("operator torchvision::nms does not exist"))
     assert "pip install --force-reinstall --no-deps torchvision" in str(found)

@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 import yaml
 
-from nerf_lightning.runs.index import Run, read_run
-from tests.helpers.run_results import MakeRun, results
+from nerf_lightning.runs.summaries import RunSummary, read_run
+from tests.helpers.run_results import MakeRun, make_results
 
 
 def run_maker(root: Path) -> MakeRun:
     """Writes a run's folder below a root and reads it: make_run(name, config={...}, psnr=..., ...)."""
 
-    def make(name: str, config: dict[str, Any] | None = None, text: str | None = None, **changes: Any) -> Run:
+    def make(name: str, config: dict[str, Any] | None = None, text: str | None = None, **changes: Any) -> RunSummary:
         folder = root / name
         folder.mkdir(parents=True)
-        figures = results(**changes)
+        figures = make_results(**changes)
         plain = {
             "method": figures["method"],
             "recipe": None,

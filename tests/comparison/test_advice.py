@@ -19,7 +19,7 @@ def points(make_run: MakeRun) -> pd.DataFrame:
     return found
 
 
-def test_recommend_merges_what_one_point_is_best_at(points: pd.DataFrame):
+def test_recommend_merges_sentences_of_same_point(points: pd.DataFrame):
     assert recommend(points, 1.0, 15) == [
         "Best: slow: 33.00 dB (one seed) after 60.1 s, 9 MB.",
         "Fastest within 1 dB of the best and best after at most 15 s of training: quick: 32.60 dB (one seed)"
@@ -28,14 +28,14 @@ def test_recommend_merges_what_one_point_is_best_at(points: pd.DataFrame):
     ]
 
 
-def test_recommend_tells_the_spread_of_seeds_and_collapsed_runs(make_run: MakeRun):
+def test_recommend_reports_seed_range_and_collapsed_runs(make_run: MakeRun):
     runs = [make_run(f"s{seed}", seed=seed, psnr=30.0 - seed) for seed in range(2)]
     assert "29.00 to 30.00 over 2 seeds" in recommend(compute_points(runs)[0][1], 0.5, 15)[0]
     lost = make_run("lost", seed=2, psnr=9.0, status="collapsed")
     assert "1 of 3 runs collapsed" in recommend(compute_points([*runs, lost])[0][1], 0.5, 15)[0]
 
 
-def test_list_caveats_names_a_busy_machine_and_few_seeds(make_run: MakeRun):
+def test_list_caveats_reports_busy_machine_and_few_seeds(make_run: MakeRun):
     busy = make_run("busy", {"recipe": "x"}, psnr=20.0, load={"own": 1.2, "others": 0.8})
     free = make_run("free", {"recipe": "y"}, psnr=10.0, threads=2, load={"own": 1.0, "others": 0.02})
     told = list_caveats(compute_points([make_run("calm"), busy, free])[0][1])

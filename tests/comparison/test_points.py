@@ -6,7 +6,7 @@ import random
 import numpy as np
 import pandas as pd
 
-from nerf_lightning.comparison.points import compute_points, find_frontier, typical_run
+from nerf_lightning.comparison.points import compute_points, find_frontier, find_median_run
 from tests.helpers.run_results import MakeRun
 
 
@@ -16,12 +16,12 @@ def test_compute_points_seeds_of_one_configuration_are_one_point(make_run: MakeR
     (point,) = points.itertuples()
     assert (point.label, point.psnr, point.psnr_min, point.psnr_max, point.collapsed) == ("grid", 30.5, 29.0, 31.0, 0)
     assert (point.train_seconds, point.render_seconds, point.bytes) == (5.01, 0.1, 40_000)
-    assert typical_run(point) is runs[2]
+    assert find_median_run(point) is runs[2]
     assert point.options["model.width"] == 16
     assert not [key for key in point.options if "seed" in key or "path" in key or key.startswith("callbacks")]
 
 
-def test_compute_points_other_options_are_other_points_named_by_what_differs(make_run: MakeRun):
+def test_compute_points_options_that_differ_label_points(make_run: MakeRun):
     narrow, wide = ({"model": {"_target_": "fields.grid", "width": width, "depth": 2}} for width in (16, 64))
     longer = {"budget": {"steps": 2000, "seconds": None}}
     configs = {"a": narrow, "b": wide, "c": narrow | longer, "d": {"recipe": "tiny"}}
@@ -31,7 +31,7 @@ def test_compute_points_other_options_are_other_points_named_by_what_differs(mak
     }  # fmt: skip
 
 
-def test_compute_points_other_conditions_stand_apart_and_the_fullest_come_first(make_run: MakeRun):
+def test_compute_points_groups_by_conditions_largest_first(make_run: MakeRun):
     scene = {"name": "other", "sha256": "cd" * 32, "views": {"train": 9, "val": 2}, "resolution": [8, 6]}
     machine = {"processor": "slide rule", "cores": 2, "accelerator": None}
     runs = [
@@ -51,13 +51,13 @@ def test_compute_points_other_conditions_stand_apart_and_the_fullest_come_first(
     )  # fmt: skip
 
 
-def test_compute_points_a_collapsed_seed_counts_as_the_worst(make_run: MakeRun):
+def test_compute_points_collapsed_seed_counts_as_worst(make_run: MakeRun):
     good = [make_run(f"s{seed}", seed=seed, psnr=30.0 + seed) for seed in range(2)]
     collapsed = make_run("collapsed", seed=2, psnr=9.8, status="collapsed")
     ((_, points),) = compute_points([*good, collapsed])
     (point,) = points.itertuples()
     assert (point.psnr, point.psnr_min, point.collapsed) == (30.0, -math.inf, 1)
-    assert typical_run(point) is good[0]
+    assert find_median_run(point) is good[0]
     assert compute_points([good[0], collapsed]) == [], "of two runs one is left"
 
 
@@ -66,7 +66,7 @@ def dominated(i: int, costs: list[float], gains: list[float]) -> bool:
     return any(c <= costs[i] and g >= gains[i] and (c < costs[i] or g > gains[i]) for c, g in others)
 
 
-def test_find_frontier_holds_exactly_the_points_that_none_dominates():
+def test_find_frontier_matches_brute_force():
     chance = random.Random(0)
     for count in (1, 4, 40):
         for _ in range(20):
@@ -77,7 +77,7 @@ def test_find_frontier_holds_exactly_the_points_that_none_dominates():
     assert list(find_frontier(pd.Series([np.nan, 2.0]), pd.Series([9.0, 1.0]))) == [1], "an unknown cost is on none"
 
 
-def test_compute_points_frontiers_take_seconds_that_differ_by_noise_as_equal(make_run: MakeRun):
+def test_compute_points_frontier_ignores_timing_noise(make_run: MakeRun):
     kinds = {"a": (5.01, 25.0), "b": (5.04, 30.0), "c": (9.0, 29.0)}
     runs = [make_run(n, {"recipe": n}, train_seconds=seconds, psnr=psnr) for n, (seconds, psnr) in kinds.items()]
     ((_, points),) = compute_points(runs)

@@ -9,7 +9,7 @@ import pytest
 
 from nerf_lightning.cli.compare import compare
 from nerf_lightning.comparison.charts import draw_cost
-from nerf_lightning.comparison.points import PUBLISHED, compute_points, read_references
+from nerf_lightning.comparison.points import PUBLISHED_FILE, compute_points, read_references
 from nerf_lightning.comparison.report import collect_images
 from nerf_lightning.errors import InputError
 from tests.comparison.conftest import run_maker
@@ -39,7 +39,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root / "out"
 
 
-def test_compare_writes_a_page_a_figure_and_a_table(folder: Path):
+def test_compare_writes_page_figure_and_table(folder: Path):
     assert sorted(path.name for path in folder.iterdir()) == ["compare.csv", "compare.html", "compare.png"]
     figure = imageio.imread(folder / "compare.png")
     assert figure.shape[1] == 1720 and figure.std() > 10
@@ -69,14 +69,14 @@ def test_compare_page_is_self_contained_and_escapes_names(folder: Path):
         ({"runs": [Path()], "references": "missing.yaml"}, "missing.yaml"),
     ],
 )
-def test_compare_bad_input_is_named(arguments: dict, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_compare_bad_input_raises(arguments: dict, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=words):
         compare(*arguments.pop("runs"), **arguments)
     assert not list(tmp_path.iterdir())
 
 
-def test_draw_cost_names_few_points_and_publications_beyond_the_axis_with_their_time(make_run: MakeRun, tmp_path: Path):
+def test_draw_cost_labels_points_and_off_axis_publications(make_run: MakeRun, tmp_path: Path):
     (tmp_path / "mine.yaml").write_text(f"mine:\n{ENTRY}{METHODS}")
     runs = [make_run(name, {"recipe": name}, train_seconds=10.0 + n, psnr=30.0 + n) for n, name in enumerate("abc")]
     points = compute_points(runs)[0][1].assign(style=[("black", "o")] * 3)
@@ -88,7 +88,7 @@ def test_draw_cost_names_few_points_and_publications_beyond_the_axis_with_their_
         "Pareto frontier",
     ]
     assert 300 < axes.get_xlim()[1] < 1000
-    (axes,) = draw_cost(points, "bytes", read_references(PUBLISHED).head(0)).axes
+    (axes,) = draw_cost(points, "bytes", read_references(PUBLISHED_FILE).head(0)).axes
     assert axes.get_legend() is None, "one size, so one point on the frontier and no key"
 
 
@@ -114,8 +114,8 @@ def test_read_references_damaged_file_is_one_error(text: str, tmp_path: Path):
         read_references(tmp_path / "mine.yaml")
 
 
-def test_read_references_of_the_package_are_sound():
-    found = read_references(PUBLISHED)
+def test_read_references_published_file_is_valid():
+    found = read_references(PUBLISHED_FILE)
     assert len(found) == 8 * 11 + 2 and found["scene"].nunique() == 8 and found["psnr"].between(13, 40).all()
     (ngp_pl,) = found[(found["name"] == "ngp_pl") & (found["scene"] == "lego")].itertuples()
     assert (ngp_pl.psnr, ngp_pl.seconds) == (35.76, 305)

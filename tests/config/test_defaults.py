@@ -20,7 +20,7 @@ def targets(node: Any) -> Iterator[dict[str, Any]]:
             yield from targets(value)
 
 
-def test_signatures_and_conf_agree():
+def test_conf_defaults_match_signatures():
     written: dict[tuple[str, str], list[Any]] = defaultdict(list)
     for file in sorted(conf_dir().rglob("*.yaml")):
         for node in targets(yaml.safe_load(file.read_text(encoding="utf-8"))):

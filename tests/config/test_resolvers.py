@@ -2,18 +2,18 @@
 
 import pytest
 
-from nerf_lightning.config.resolvers import LONGEST, fixed_keys, job_name, slug, sweep_folder
+from nerf_lightning.config.resolvers import MAX_SLUG_CHARS, fixed_keys, job_name, slugify, sweep_folder
 
 
-def test_slug_replaces_letters_that_file_systems_mind():
-    assert slug("model.width=16,path=/a b/'c'") == "model.width=16,path=-a-b--c-"
-    assert slug("") == "all"
+def test_slugify_replaces_reserved_characters():
+    assert slugify("model.width=16,path=/a b/'c'") == "model.width=16,path=-a-b--c-"
+    assert slugify("") == "all"
 
 
-def test_slug_of_long_text_is_cut_and_stays_distinct():
-    first, second = (slug("x=" + "a" * 300 + end) for end in "01")
-    assert len(first) == len(second) == LONGEST and first != second
-    assert slug("x" * LONGEST) == "x" * LONGEST
+def test_slugify_long_text_is_truncated_with_hash():
+    first, second = (slugify("x=" + "a" * 300 + end) for end in "01")
+    assert len(first) == len(second) == MAX_SLUG_CHARS and first != second
+    assert slugify("x" * MAX_SLUG_CHARS) == "x" * MAX_SLUG_CHARS
 
 
 @pytest.mark.parametrize(
@@ -32,8 +32,8 @@ def test_sweep_folder_is_named_after_the_command_line(arguments: list[str], fold
 
 def test_job_name_leaves_out_fixed_keys():
     arguments = ["-m", "+experiment=lego", "budget.steps=5", "x=1e-6", "seed=0,1", "model.width=choice(8,16)"]
-    fixed = fixed_keys([*arguments, "optimizer.lr=interval(1e-4,1e-2)", "callbacks.heldout.at=[0.1,0.2]"])
-    assert fixed == ["budget.steps", "callbacks.heldout.at", "experiment", "x"]
+    fixed = fixed_keys([*arguments, "optimizer.lr=interval(1e-4,1e-2)", "callbacks.validation.fractions=[0.1,0.2]"])
+    assert fixed == ["budget.steps", "callbacks.validation.fractions", "experiment", "x"]
     overrides = ["+experiment=lego", "model.width=8", "seed=1", "budget.steps=5", "x=1e-06"]
     assert job_name(overrides, fixed) == "model.width=8,seed=1"
     assert job_name(["seed=0"], fixed_keys(["-m", "seed=0"])) == "all"

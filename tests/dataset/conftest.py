@@ -6,7 +6,7 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from nerf_lightning.cameras import Bounds, Cameras, orbit_around
+from nerf_lightning.cameras import Bounds, Cameras, make_circle_poses
 from nerf_lightning.dataset import Scene, Views
 
 CENTRE = torch.tensor([0.3, -0.2, 0.1])
@@ -19,12 +19,12 @@ def ball_views(per_ring: int, elevations: tuple[float, ...] = (-0.6, 0.2, 0.9), 
     up = torch.tensor([0.0, 0.0, 1.0])
     c, s = math.cos(turn), math.sin(turn)
     spin = torch.tensor([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    c2w = torch.cat([spin @ orbit_around(torch.zeros(3), up, 4.0, e, per_ring) for e in elevations])
+    c2w = torch.cat([spin @ make_circle_poses(torch.zeros(3), up, 4.0, e, per_ring) for e in elevations])
     K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    cameras = Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, WIDTH, HEIGHT)
+    cameras = Cameras.pinhole(K.repeat(len(c2w), 1, 1), c2w, WIDTH, HEIGHT)
     images = []
     for view in range(len(c2w)):
-        rays = cameras.view_rays(view)
+        rays = cameras.generate_view_rays(view)
         to_ball = CENTRE - rays.origins
         along = (to_ball * rays.directions).sum(-1)
         under = RADIUS**2 - (to_ball.square().sum(-1) - along**2)
@@ -32,7 +32,7 @@ def ball_views(per_ring: int, elevations: tuple[float, ...] = (-0.6, 0.2, 0.9), 
         rgb = ((hit - CENTRE) / RADIUS * 0.5 + 0.5).clamp(0, 1) * 0.8 + 0.2
         rgba = torch.cat([rgb, torch.ones_like(along)[:, None]], dim=-1) * (under > 0)[:, None]
         images.append((rgba * 255).round().to(torch.uint8).view(HEIGHT, WIDTH, 4))
-    return Views.of(torch.stack(images), cameras)
+    return Views.from_images(torch.stack(images), cameras)
 
 
 @pytest.fixture(scope="session")

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from nerf_lightning.dataset import PhotoLoadOptions, load_blender, load_npz
-from nerf_lightning.dataset.resize import area_resize
+from nerf_lightning.dataset.resize import resize_area
 
 ANGLE = 2 * float(np.arctan(0.5 * 8 / 10))  # focal 10 at 8 pixels width
 
@@ -80,12 +80,12 @@ def test_load_blender_splits_follow_the_files(folder: Path):
     assert (len(scene.train), len(scene.val)) == (1, 1)
 
 
-def test_area_resize_alpha_leaves_no_dark_rim():
+def test_resize_area_alpha_leaves_no_dark_rim():
     """White under alpha 1, black under alpha 0: every pixel with any alpha must stay white."""
     x, y = np.meshgrid(np.arange(50), np.arange(50))
     disc = ((x - 25) ** 2 + (y - 22) ** 2 < 300)[..., None]
     image = np.where(disc, 255, 0).astype(np.uint8).repeat(4, axis=2)
-    small = area_resize(image, 19, 19)
+    small = resize_area(image, 19, 19)
     partial = (small[..., 3] > 0) & (small[..., 3] < 255)
     assert partial.sum() > 20
     assert (small[partial][:, :3] == 255).all()
@@ -93,14 +93,14 @@ def test_area_resize_alpha_leaves_no_dark_rim():
 
 
 @pytest.mark.real_data
-def test_lego_is_the_same_scene_in_both_formats(real_data: Path):
+def test_open_scene_lego_is_equal_in_both_formats(real_data: Path):
     blender = load_blender(real_data / "nerf_synthetic" / "lego", options=PhotoLoadOptions(resize=200))
     course = load_npz(real_data / "lego_200x200.npz")
     assert (blender.name, len(blender.train), len(blender.val)) == ("lego", 100, 10)
     for split in ("train", "val"):
         ours, theirs = getattr(blender, split), getattr(course, split)
         for view in (0, len(ours) - 1):
-            a, b = ours.cameras.view_rays(view), theirs.cameras.view_rays(view)
+            a, b = ours.cameras.generate_view_rays(view), theirs.cameras.generate_view_rays(view)
             torch.testing.assert_close(a.origins, b.origins, atol=1e-4, rtol=0)
             torch.testing.assert_close(a.directions, b.directions, atol=1e-4, rtol=0)
         rgba, rgb = ours.images[::10].float(), theirs.images[::10].float()

@@ -11,8 +11,8 @@ from PIL import Image
 
 from nerf_lightning.dataset import PhotoLoadOptions, Views, open_scene
 from nerf_lightning.errors import InputError
-from tests.helpers.colmap_files import cameras_of, write_colmap, write_llff, write_transforms
-from tests.helpers.exif_tags import tags
+from tests.helpers.exif_tags import encode_exif
+from tests.helpers.scene_writers import colmap_cameras, write_colmap, write_llff, write_transforms
 
 
 def write_sideways(format: str, folder: Path, views: Views) -> Path:
@@ -21,10 +21,10 @@ def write_sideways(format: str, folder: Path, views: Views) -> Path:
     names = [f"{i:04d}.jpg" for i in range(len(views))]
     for i, name in enumerate(names):
         stored = np.rot90(views.image(i)[..., :3].numpy(), 1).copy()
-        Image.fromarray(stored).save(folder / "images" / name, quality=95, exif=tags(orientation=6))
+        Image.fromarray(stored).save(folder / "images" / name, quality=95, exif=encode_exif(orientation=6))
     width, height = views.cameras.size(0)
     if format == "colmap":
-        write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views))
+        write_colmap(folder / "sparse/0", views.cameras.c2w.numpy(), names, colmap_cameras(views))
     elif format == "llff":
         write_llff(folder / "poses_bounds.npy", views)
     else:
@@ -52,7 +52,7 @@ def test_open_scene_square_photos_stay_as_stored(
     ball_views_of: Callable[..., Views], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
     views = ball_views_of(3)
-    square = Views.of(views.images[:, :, 4:44].contiguous(), views.cameras.resized((40, 40)))
+    square = Views.from_images(views.images[:, :, 4:44].contiguous(), views.cameras.resize((40, 40)))
     folder = write_sideways("transforms", tmp_path / "s", square)
     with caplog.at_level(logging.WARNING):
         stored = open_scene(str(folder))

@@ -7,10 +7,10 @@ import pytest
 import torch
 from PIL import Image
 
-from nerf_lightning.dataset import builtin_picture, load_picture
-from nerf_lightning.dataset.formats.decode import read_pixels
+from nerf_lightning.dataset import load_picture, make_builtin_picture
+from nerf_lightning.dataset.formats.image_files import read_pixels
 from nerf_lightning.errors import InputError
-from tests.helpers.exif_tags import tags
+from tests.helpers.exif_tags import encode_exif
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
 
@@ -47,7 +47,7 @@ def test_load_picture_exif_orientation_is_applied(
 ):
     """8 turns the picture back a quarter: left becomes bottom."""
     path = tmp_path / "a.jpg"
-    Image.fromarray(red_then_blue).save(path, quality=95, exif=tags(orientation))
+    Image.fromarray(red_then_blue).save(path, quality=95, exif=encode_exif(orientation))
     picture = load_picture(path)
     assert picture.shape == ((64, 32, 3) if orientation == 8 else (32, 64, 3))
     assert (picture[red_corner].int() - torch.tensor(RED)).abs().max() < 8
@@ -83,9 +83,9 @@ def test_load_picture_float_pixels_raise(tmp_path: Path):
 
 
 def test_builtin_picture_is_deterministic_and_detailed():
-    picture = builtin_picture(128)
+    picture = make_builtin_picture(128)
     assert picture.shape == (128, 128, 3) and picture.dtype == torch.uint8
-    assert torch.equal(picture, builtin_picture(128))
+    assert torch.equal(picture, make_builtin_picture(128))
     assert (picture.float().std((0, 1)) > 20).all(), "colourful in every channel"
 
 

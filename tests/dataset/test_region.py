@@ -12,22 +12,22 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras, Layout
+from nerf_lightning.cameras import CameraLayout, Cameras
 from nerf_lightning.dataset import PhotoLoadOptions, Scene, Views, open_scene
 from nerf_lightning.dataset.region import PAN_DEPTH, find_region
-from tests.helpers.camera_paths import CENTRE, RADIUS, forward, pan, ring, walk
-from tests.helpers.colmap_files import cameras_of, photos, write_colmap, write_transforms
+from tests.helpers.camera_paths import CENTRE, RADIUS, forward, pan, ring_poses, walk
+from tests.helpers.scene_writers import colmap_cameras, write_colmap, write_photos, write_transforms
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 
 
-def scattered(low: tuple[float, ...], high: tuple[float, ...], count: int = 400) -> Float[Tensor, "P 3"]:
+def sample_box(low: tuple[float, ...], high: tuple[float, ...], count: int = 400) -> Float[Tensor, "P 3"]:
     """Points in a box around `CENTRE`."""
     share = torch.rand(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return CENTRE + torch.tensor(low) + share * (torch.tensor(high) - torch.tensor(low))
 
 
-def sphere(radius: float) -> Float[Tensor, "P 3"]:
+def sample_sphere(radius: float) -> Float[Tensor, "P 3"]:
     """Points all around `CENTRE`."""
     points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return CENTRE + radius * points / points.norm(dim=1, keepdim=True)
@@ -38,18 +38,18 @@ def size_of(scene: Scene) -> float:
     return float(torch.linalg.det(scene.to_source[:3, :3].double()) ** (1 / 3))
 
 
-def views_at(c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Views:
+def make_views(c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Views:
     """Photos of what is drawn, or of noise."""
     K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).repeat(len(c2w), 1, 1)
-    cameras = Cameras.of_size(K, c2w.float(), WIDTH, HEIGHT)
+    cameras = Cameras.pinhole(K, c2w.float(), WIDTH, HEIGHT)
     noise = torch.randint(0, 255, (len(c2w), HEIGHT, WIDTH, 3), generator=torch.manual_seed(0)).to(torch.uint8)
-    return Views.of(noise if draw is None else draw(cameras), cameras)
+    return Views.from_images(noise if draw is None else draw(cameras), cameras)
 
 
-def folder_of(folder: Path, c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Path:
+def write_folder(folder: Path, c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Path:
     """A capture of what is drawn, or of noise, as transforms.json."""
-    views = views_at(c2w, draw)
-    write_transforms(folder / "transforms.json", views, photos(folder, views), w=WIDTH, h=HEIGHT)
+    views = make_views(c2w, draw)
+    write_transforms(folder / "transforms.json", views, write_photos(folder, views), w=WIDTH, h=HEIGHT)
     return folder
 
 
@@ -57,12 +57,12 @@ def folder_of(folder: Path, c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras
 def test_find_region_ring_is_centred_on_its_subject(yaw: int, distance: float):
     radius = RADIUS * distance
     for elevation in (10.0, 25.0, 40.0):
-        region = find_region(ring(32, yaw, elevation, radius=radius))
-        assert region.layout == Layout.INWARD and region.known
+        region = find_region(ring_poses(32, yaw, elevation, radius=radius))
+        assert region.layout == CameraLayout.INWARD and region.has_depth
         assert float((region.centre - CENTRE).norm()) < 0.1 * radius
         assert region.unit == pytest.approx(radius, rel=0.05)
         shift = torch.tensor([449500.25, 5411200.75, 210.5], dtype=torch.float64)  # a georeferenced frame
-        there = ring(32, yaw, elevation, radius=radius)
+        there = ring_poses(32, yaw, elevation, radius=radius)
         there[:, :3, 3] += shift
         far = find_region(there)
         torch.testing.assert_close(far.centre - shift, region.centre, atol=1e-6, rtol=0)
@@ -71,15 +71,15 @@ def test_find_region_ring_is_centred_on_its_subject(yaw: int, distance: float):
 
 def test_find_region_arc_is_centred_by_points():
     """A subject, and a wall behind it that few of the photos show."""
-    points = torch.cat([scattered((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), scattered((-6, -6, -1), (-5, 6, 4))])
-    region = find_region(ring(24, 15, degrees=150), points)
+    points = torch.cat([sample_box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), sample_box((-6, -6, -1), (-5, 6, 4))])
+    region = find_region(ring_poses(24, 15, degrees=150), points)
     assert float((region.centre - CENTRE).norm()) < 0.1 * RADIUS
     assert region.unit == pytest.approx(RADIUS, rel=0.1)
 
 
 @pytest.mark.parametrize("diverging", [-0.3, 0.2])
 def test_find_region_forward_is_centred_on_points(diverging: float):
-    region = find_region(forward(diverging), scattered((2.5, -1, -0.7), (3.5, 1, 0.7)))
+    region = find_region(forward(diverging), sample_box((2.5, -1, -0.7), (3.5, 1, 0.7)))
     assert region.has_subject
     assert float((region.centre - CENTRE - torch.tensor([3.0, 0, 0])).norm()) < 0.4
     assert region.unit == pytest.approx(3.0, rel=0.15)
@@ -87,8 +87,8 @@ def test_find_region_forward_is_centred_on_points(diverging: float):
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_find_region_pan_is_centred_on_its_camera(noise: float):
-    region = find_region(pan(noise), sphere(3.0))
-    assert region.layout == Layout.PAN and region.known and not region.has_subject
+    region = find_region(pan(noise), sample_sphere(3.0))
+    assert region.layout == CameraLayout.PAN and region.has_depth and not region.has_subject
     assert float((region.centre - CENTRE).norm()) < noise + 1e-9
     assert region.unit == pytest.approx(3.0 / PAN_DEPTH, rel=0.05)
 
@@ -97,17 +97,17 @@ def test_find_region_walk_holds_its_cameras():
     c2w = walk()
     region = find_region(c2w, c2w[:, :3, 3] + 3 * c2w[:, :3, 2])
     inside = ((c2w[:, :3, 3] - region.centre).abs() <= region.unit).all(1).double().mean()
-    assert region.layout == Layout.WALK and region.known and inside >= 0.8
+    assert region.layout == CameraLayout.WALK and region.has_depth and inside >= 0.8
     assert 2.5 < region.unit < 8.0
 
 
-def inside_a_ball(cameras: Cameras, radius: float = 3.0) -> UInt8[Tensor, "V H W 3"]:
+def render_inside_ball(cameras: Cameras, radius: float = 3.0) -> UInt8[Tensor, "V H W 3"]:
     """Photos from within a ball around the origin that is painted with coarse noise."""
     paint = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (512, 1024, 3)).astype(np.float32), (0, 0), 3)
     paint = (128 + 12 * (paint - paint.mean())).clip(0, 255).astype(np.uint8)
     images = []
     for view in range(len(cameras)):
-        rays = cameras.view_rays(view)
+        rays = cameras.generate_view_rays(view)
         along = (rays.origins * rays.directions).sum(1, keepdim=True)
         depth = -along + (along.square() - rays.origins.square().sum(1, keepdim=True) + radius**2).sqrt()
         x, y, z = (rays.origins + depth * rays.directions).view(HEIGHT, WIDTH, 3).numpy().transpose(2, 0, 1) / radius
@@ -118,14 +118,14 @@ def inside_a_ball(cameras: Cameras, radius: float = 3.0) -> UInt8[Tensor, "V H W
 
 @pytest.mark.parametrize(
     ("c2w", "layout"),
-    [(pan(0.05, seed=1), Layout.PAN), (forward(0.1), Layout.FORWARD)],
+    [(pan(0.05, seed=1), CameraLayout.PAN), (forward(0.1), CameraLayout.FORWARD)],
     ids=["pan", "forward"],
 )
-def test_open_scene_without_depth_matches_photos(c2w: torch.Tensor, layout: Layout, tmp_path: Path):
+def test_open_scene_without_depth_matches_photos(c2w: torch.Tensor, layout: CameraLayout, tmp_path: Path):
     c2w = c2w.clone()
     c2w[:, :3, 3] -= CENTRE
-    scene = open_scene(str(folder_of(tmp_path, c2w, inside_a_ball)), options=PhotoLoadOptions(holdout=8))
-    assert size_of(scene) * (PAN_DEPTH if layout == Layout.PAN else 1) == pytest.approx(3, rel=0.2)
+    scene = open_scene(str(write_folder(tmp_path, c2w, render_inside_ball)), options=PhotoLoadOptions(holdout=8))
+    assert size_of(scene) * (PAN_DEPTH if layout == CameraLayout.PAN else 1) == pytest.approx(3, rel=0.2)
     assert scene.points is not None and len(scene.points) > 50
     places = scene.points.double() @ scene.to_source[:3, :3].double().T + scene.to_source[:3, 3]
     assert float((places.norm(dim=1) - 3).abs().median()) < 0.3, "most points lie on the ball"
@@ -134,16 +134,16 @@ def test_open_scene_without_depth_matches_photos(c2w: torch.Tensor, layout: Layo
 @pytest.mark.parametrize("noise", [0.0, 0.02])
 def test_open_scene_pan_unknown_depth_warns(noise: float, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     with caplog.at_level(logging.WARNING):
-        scene = open_scene(str(folder_of(tmp_path, pan(noise))))
+        scene = open_scene(str(write_folder(tmp_path, pan(noise))))
     assert ("how far away" in caplog.text) == (noise > 0)
     assert scene.bounds.unbounded and scene.bounds.near is None
     assert float((scene.to_source[:3, 3].double() - CENTRE).norm()) < 0.05
 
 
 def test_open_scene_colmap_points_are_in_the_scenes_frame(tmp_path: Path):
-    views, points = views_at(ring(16)), scattered((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
-    names = photos(tmp_path / "images", views)
-    write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, cameras_of(views), points=points.numpy())
+    views, points = make_views(ring_poses(16)), sample_box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3))
+    names = write_photos(tmp_path / "images", views)
+    write_colmap(tmp_path / "sparse/0", views.cameras.c2w.numpy(), names, colmap_cameras(views), points=points.numpy())
     scene = open_scene(str(tmp_path))
     assert scene.points is not None
     back = scene.points.double() @ scene.to_source[:3, :3].double().T + scene.to_source[:3, 3]

@@ -11,14 +11,14 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from benchmarks.synthetic.photos import Truth
-from benchmarks.video import aligned
-from nerf_lightning.capture.poses.geometry import inverse
-from nerf_lightning.dataset.formats.decode import read_pixels
+from benchmarks.video import align_poses
+from nerf_lightning.capture.poses.geometry import invert_pose
+from nerf_lightning.dataset.formats.image_files import read_pixels
 from nerf_lightning.dataset.sfm import colmap
-from nerf_lightning.dataset.sfm import photos as module
-from nerf_lightning.dataset.sfm.photos import find_photos, place_photos
+from nerf_lightning.dataset.sfm import photo_folder as module
+from nerf_lightning.dataset.sfm.photo_folder import find_photos, run_sfm
 from nerf_lightning.errors import InputError
-from tests.helpers.exif_tags import tags
+from tests.helpers.exif_tags import encode_exif
 
 SMALLER = ("3.jpg", "4.jpg")
 """Taken by a second camera."""
@@ -27,17 +27,17 @@ TURNED = ("5.jpg", "6.jpg")
 
 
 @pytest.fixture(scope="module")
-def photos(made: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def photos(tag_capture: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A third of the way around an object: two cameras, and two photos with an EXIF rotation; read only."""
     folder = tmp_path_factory.mktemp("photos")
-    for number, path in enumerate(sorted((made[0] / "photos").iterdir())):
+    for number, path in enumerate(sorted((tag_capture[0] / "photos").iterdir())):
         pixels = read_pixels(path)
         name = f"{number}.jpg"
         if name in SMALLER:
             pixels = cv2.resize(pixels, (380, 285), interpolation=cv2.INTER_AREA)
         stored = np.rot90(pixels) if name in TURNED else pixels
         # 350 pixels of 400x300 are 30 mm of a film; the smaller photos do not tell.
-        exif = tags(6 if name in TURNED else 1, focal_35mm=0 if name in SMALLER else 30)
+        exif = encode_exif(6 if name in TURNED else 1, focal_35mm=0 if name in SMALLER else 30)
         Image.fromarray(np.ascontiguousarray(stored)).save(folder / name, quality=97, exif=exif)
     return folder
 
@@ -68,7 +68,7 @@ def own(photos: Path, placed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     return folder, calls
 
 
-def test_reconstruct_two_cameras_gives_full_size_upright_model(placed, made: tuple[Path, Truth], tmp_path: Path):
+def test_reconstruct_two_cameras_gives_full_size_upright_model(placed, tag_capture: tuple[Path, Truth], tmp_path: Path):
     placed[0].write_binary(tmp_path)
     model = pycolmap.Reconstruction(tmp_path)
     images = {image.name: image for image in model.images.values() if image.has_pose}
@@ -87,9 +87,9 @@ def test_reconstruct_two_cameras_gives_full_size_upright_model(placed, made: tup
     model.update_point_3d_errors()
     assert error == pytest.approx(model.compute_mean_reprojection_error()) and 0.05 < error < 1.5
     last = [[0.0, 0.0, 0.0, 1.0]]
-    found = np.stack([inverse(np.concatenate([i.cam_from_world().matrix(), last])) for i in images.values()])
-    truth = np.stack([made[1].photos[f"{int(Path(name).stem):03d}.png"] for name in images])
-    off = np.linalg.norm(aligned(found, truth)[:, :3, 3] - truth[:, :3, 3], axis=-1)
+    found = np.stack([invert_pose(np.concatenate([i.cam_from_world().matrix(), last])) for i in images.values()])
+    truth = np.stack([tag_capture[1].photos[f"{int(Path(name).stem):03d}.png"] for name in images])
+    off = np.linalg.norm(align_poses(found, truth)[:, :3, 3] - truth[:, :3, 3], axis=-1)
     assert np.median(off / np.linalg.norm(truth[:, :3, 3], axis=-1)) < 0.05
 
 
@@ -112,10 +112,10 @@ def test_reconstruct_exif_focal_is_the_prior(placed):
         ({"focal": IFDRational(50, 0), "make": " A\0  B "}, None),
     ],
 )
-def test_lens_tags_let_colmap_infer_focal(exif: dict, pixels: float | None, tmp_path: Path):
+def test_read_lens_tags_let_colmap_infer_focal(exif: dict, pixels: float | None, tmp_path: Path):
     photo, copy = tmp_path / "a.jpg", tmp_path / "copy.jpg"
-    Image.new("RGB", (60, 40)).save(photo, exif=tags(6, **exif))
-    Image.new("RGB", (600, 400)).save(copy, exif=colmap.lens_tags(photo))
+    Image.new("RGB", (60, 40)).save(photo, exif=encode_exif(6, **exif))
+    Image.new("RGB", (600, 400)).save(copy, exif=colmap.read_lens_tags(photo))
     with Image.open(copy) as image:
         assert 0x0112 not in image.getexif()  # upright already
     camera = pycolmap.infer_camera_from_image(copy)
@@ -123,30 +123,30 @@ def test_lens_tags_let_colmap_infer_focal(exif: dict, pixels: float | None, tmp_
     assert pixels is None or camera.mean_focal_length() == pytest.approx(pixels, rel=1e-3)
 
 
-def test_place_photos_twice_reconstructs_once(own, caplog: pytest.LogCaptureFixture):
+def test_run_sfm_twice_reconstructs_once(own, caplog: pytest.LogCaptureFixture):
     folder, calls = own
     caplog.set_level(logging.INFO)
-    assert place_photos(folder) == place_photos(folder) and calls == [8]
+    assert run_sfm(folder) == run_sfm(folder) and calls == [8]
     assert "kept from an earlier run" in caplog.text and "of 8 photos placed" in caplog.text
-    assert pycolmap.Reconstruction(place_photos(folder)).num_reg_images() >= 7
+    assert pycolmap.Reconstruction(run_sfm(folder)).num_reg_images() >= 7
     shutil.copy(folder / "7.jpg", folder / "8.jpg")
-    place_photos(folder)
+    run_sfm(folder)
     assert "made of other files" in caplog.text and "not placed" in caplog.text and "8.jpg" in caplog.text
     (folder / "8.jpg").touch()
-    place_photos(folder)
+    run_sfm(folder)
     assert calls == [8, 9, 9]
 
 
-def test_place_photos_of_disconnected_photos_raises(own, monkeypatch: pytest.MonkeyPatch):
+def test_run_sfm_disconnected_photos_raise(own, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "reconstruct", lambda photos, workspace: None)
     with pytest.raises(InputError, match="0 of 8 photos that hang together, expected at least 3; take more photos"):
-        place_photos(own[0])
+        run_sfm(own[0])
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[colmap\]'"):
-        place_photos(own[0])
+        run_sfm(own[0])
 
 
-def test_pair_photos_of_many_gives_neighbours_and_landmarks():
+def test_pair_photos_many_gives_window_and_loop_pairs():
     assert len(colmap.pair_photos(150)) == 150 * 149 // 2
     some = colmap.pair_photos(1000)
     assert len(some) == len(set(some)) < 25_000 and all(0 <= i < j < 1000 for i, j in some)

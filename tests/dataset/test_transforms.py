@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from nerf_lightning.cameras import transform
+from nerf_lightning.cameras import transform_points
 from nerf_lightning.dataset import Scene, load_transforms
-from nerf_lightning.dataset.shots import PhotoLoadOptions
+from nerf_lightning.dataset.photo_loading import PhotoLoadOptions
 
 W, H = 160, 120
 INTRINSICS = {"fl_x": 140.0, "fl_y": 150.0, "cx": 83.0, "cy": 56.0, "w": W, "h": H}
@@ -24,7 +24,7 @@ def opengl_pose(angle: float) -> np.ndarray:
     return np.array([[c, 0, s, 5 * s], [0, 1, 0, 0.3], [-s, 0, c, 5 * c], [0, 0, 0, 1]])
 
 
-def seen_at(pose: np.ndarray, intrinsics: dict, point: np.ndarray) -> np.ndarray:
+def project_point(pose: np.ndarray, intrinsics: dict, point: np.ndarray) -> np.ndarray:
     """Where a lens sees a world point, in OpenCV's indices (a pixel's centre is an integer)."""
     local = pose[:3, :3].T @ (point - pose[:3, 3])
     K = np.array(
@@ -49,7 +49,7 @@ def write(folder: Path, extra: dict, per_frame: Callable[[int], dict] = lambda i
     entries = []
     for i in reversed(range(12)):  # out of order: loaders sort by file_path
         pose, own = opengl_pose(0.5 * i), per_frame(i)
-        cv2.imwrite(str(folder / f"images/{i:04d}.png"), dot(seen_at(pose, {**extra, **own}, POINT)))
+        cv2.imwrite(str(folder / f"images/{i:04d}.png"), dot(project_point(pose, {**extra, **own}, POINT)))
         entries.append({"file_path": f"images/{i:04d}.png", "transform_matrix": pose.tolist(), **own})
     (folder / "transforms.json").write_text(json.dumps({**extra, "frames": entries}))
     return folder
@@ -62,7 +62,7 @@ def capture(tmp_path: Path) -> Path:
 
 def dot_error(scene: Scene) -> float:
     """How far the rays through the dots miss POINT, in pixels, at worst."""
-    point = transform(torch.linalg.inv(scene.to_source), torch.from_numpy(POINT).float())
+    point = transform_points(torch.linalg.inv(scene.to_source), torch.from_numpy(POINT).float())
     worst = 0.0
     for views in (scene.train, scene.val):
         weights = views.images[..., 1].double()
@@ -111,9 +111,9 @@ def test_load_transforms_mask_path_is_read(capture: Path, caplog: pytest.LogCapt
     cv2.imwrite(str(capture / "mask.png"), mask)
     change(capture, lambda c: c["frames"][1].update(mask_path="mask.png", depth_file_path="depth.png"))
     with caplog.at_level(logging.INFO):
-        scene = load_transforms(capture, options=PhotoLoadOptions(masked="unknown"))
+        scene = load_transforms(capture, options=PhotoLoadOptions(masked="ignore"))
     assert "keys that are not used: depth_file_path" in caplog.text
-    assert torch.equal(scene.train.mask_of(0), torch.from_numpy(mask > 0)) and scene.train.mask_of(1).all()
+    assert torch.equal(scene.train.view_mask(0), torch.from_numpy(mask > 0)) and scene.train.view_mask(1).all()
 
 
 def test_load_transforms_missing_photos_are_left_out_with_a_warning(capture: Path, caplog: pytest.LogCaptureFixture):
@@ -159,7 +159,7 @@ def test_load_transforms_reduced_photos_keep_their_angle(capture: Path):
     assert dot_error(after) < 0.1
 
 
-def test_load_transforms_test_filenames_are_kept_apart(capture: Path):
+def test_load_transforms_test_filenames_make_a_test_split(capture: Path):
     names = [f"./images/{i:04d}.png" for i in range(12)]
     change(capture, lambda c: c.update(train_filenames=names[4:], val_filenames=names[:1], test_filenames=names[1:4]))
     scene = load_transforms(capture)

@@ -7,9 +7,9 @@ import torch
 
 from nerf_lightning.drawing.panels import (
     colorize_depth,
-    panel,
-    result_panel,
-    to_bytes,
+    make_panel,
+    make_result_panel,
+    to_uint8,
     write_animation,
 )
 from nerf_lightning.system import ViewResult
@@ -19,16 +19,16 @@ def flat(height: int, width: int, level: int) -> np.ndarray:
     return np.full((height, width, 3), level, np.uint8)
 
 
-def test_to_bytes_rounds_and_clamps():
+def test_to_uint8_rounds_and_clamps():
     image = torch.tensor([[[-1.0, 0.0, 0.499 / 255], [0.501 / 255, 1.0, 2.0]]])
-    assert to_bytes(image).tolist() == [[[0, 0, 0], [1, 255, 255]]]
+    assert to_uint8(image).tolist() == [[[0, 0, 0], [1, 255, 255]]]
 
 
 @pytest.mark.parametrize(("height", "width", "magnify"), [(160, 90, 1), (24, 40, 7)])
-def test_panel_images_stand_side_by_side_above_the_caption(height: int, width: int, magnify: int):
+def test_make_panel_puts_images_side_by_side_above_caption(height: int, width: int, magnify: int):
     images = [flat(height, width, level) for level in (50, 100, 200)]
     images[0][0, 0] = 7
-    made = panel(images, "a caption, in Grüße, far too long for a picture this narrow " * 3)
+    made = make_panel(images, "a caption, in Grüße, far too long for a picture this narrow " * 3)
     above, strip = made[: height * magnify], made[height * magnify :]
     assert (above[:magnify, :magnify] == 7).all(), "hard edges"
     assert above[-1, [int((i + 0.5) * width * magnify) for i in range(3)], 0].tolist() == [50, 100, 200]
@@ -37,10 +37,10 @@ def test_panel_images_stand_side_by_side_above_the_caption(height: int, width: i
 
 
 @pytest.mark.parametrize("with_depth", [True, False])
-def test_result_panel_shows_truth_render_and_depth_or_error(with_depth):
+def test_make_result_panel_shows_truth_render_and_depth_or_error(with_depth):
     rgb, truth = torch.full((200, 100, 3), 0.5), torch.full((200, 100, 3), 0.4)
     maps = (torch.ones(200, 100), torch.ones(200, 100)) if with_depth else (None, None)
-    made = result_panel(ViewResult(rgb, truth, 20.0, 1.0, *maps), "caption")
+    made = make_result_panel(ViewResult(rgb, truth, 20.0, 1.0, *maps), "caption")
     assert (made[100, 50] == 102).all() and (made[100, 150] == 128).all()
     third = colorize_depth(np.ones(1), 1.0, 2.0)[0] if with_depth else 102  # four times 0.1
     assert (made[100, 250] == third).all()

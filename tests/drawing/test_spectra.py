@@ -3,10 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from nerf_lightning.drawing.spectra import BANDS, amplitudes, brightness, by_frequency, spectrum_chart
+from nerf_lightning.drawing.spectra import NUM_BANDS, amplitude_spectrum, plot_spectra, radial_rms, zero_mean_luma
 
 SIDE = 256
-BAND = 0.5 / BANDS
+BAND = 0.5 / NUM_BANDS
 
 
 def wave(across: float, down: float, height: int = SIDE, width: int = SIDE) -> np.ndarray:
@@ -16,31 +16,31 @@ def wave(across: float, down: float, height: int = SIDE, width: int = SIDE) -> n
 
 
 @pytest.mark.parametrize(("across", "down"), [(51, 0), (90, -30)])
-def test_amplitudes_a_wave_is_one_peak_at_its_frequency(across: int, down: int):
-    spectrum = amplitudes(wave(across / SIDE, down / SIDE))
+def test_amplitude_spectrum_of_wave_peaks_at_its_frequency(across: int, down: int):
+    spectrum = amplitude_spectrum(wave(across / SIDE, down / SIDE))
     peaks = np.argwhere(spectrum > spectrum.max() * 0.99) - SIDE // 2
     assert sorted(map(tuple, peaks)) == sorted([(down, across), (-down, -across)])
-    frequency, size = by_frequency(spectrum)
+    frequency, size = radial_rms(spectrum)
     peak, truly = int(size.argmax()), math.hypot(across, down) / SIDE
     assert abs(frequency[peak] - truly) <= BAND / 2
     assert size[np.abs(frequency - truly) > 4 * BAND].max() < 1e-3 * size[peak], "the window keeps it from leaking"
 
 
-def test_amplitudes_powers_add_up_to_the_variance():
+def test_amplitude_spectrum_power_sums_to_variance():
     height, width = 33, 17
     grey = np.random.default_rng(0).normal(size=(height, width))
     window = np.outer(*(np.sin(np.pi * np.arange(1, n + 1) / (n + 1)) ** 2 for n in (height, width)))
-    assert (amplitudes(grey) ** 2).sum() == pytest.approx((grey**2 * window**2).sum() / (window**2).sum())
+    assert (amplitude_spectrum(grey) ** 2).sum() == pytest.approx((grey**2 * window**2).sum() / (window**2).sum())
 
 
 @pytest.mark.parametrize("shape", [(64, 48, 3), (1, 1, 3)])
-def test_spectrum_chart_shows_target_result_and_error(shape: tuple[int, int, int]):
+def test_plot_spectra_shows_target_result_and_error(shape: tuple[int, int, int]):
     target = np.random.default_rng(0).random(shape)
     result = target + 0.1 * wave(0.25, 0, *shape[:2])[..., None]
-    axes = spectrum_chart(target, result, "sunset, 30 dB").axes
+    axes = plot_spectra(target, result, "sunset, 30 dB").axes
     lines = {line.get_label(): line.get_ydata() for line in axes[2].lines}
     assert list(lines) == ["target", "result", "error"]
     for name, image in (("target", target), ("result", result), ("error", result - target)):
-        expected = by_frequency(amplitudes(brightness(image)))[1]
+        expected = radial_rms(amplitude_spectrum(zero_mean_luma(image)))[1]
         assert lines[name] == pytest.approx(expected, abs=1e-7, nan_ok=True), name
     assert [one.images[0].get_array().shape for one in axes[:2]] == 2 * [shape[:2]]

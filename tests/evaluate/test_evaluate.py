@@ -13,10 +13,10 @@ import pytest
 import torch
 
 from nerf_lightning.cli.evaluate import evaluate
-from nerf_lightning.config.compose import composed
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.evaluate import metrics
-from nerf_lightning.evaluate.metrics import DIGITS, format_table, load_lpips, to_json
+from nerf_lightning.evaluate.metrics import TABLE_DECIMALS, format_table, load_lpips, to_json
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.device import CPU
@@ -34,7 +34,7 @@ def evaluated(run: Path, **options: object) -> dict:
     return found
 
 
-def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFixture[str]):
+def test_evaluate_matches_results_of_run(run: Path, capsys: pytest.CaptureFixture[str]):
     found = evaluated(run, device="cpu")
     out = capsys.readouterr().out
     results = json.loads((run / "results.json").read_text())
@@ -50,28 +50,28 @@ def test_every_view_is_judged_as_the_run_was(run: Path, capsys: pytest.CaptureFi
     assert len(imageio.imread(run / "evaluation" / "worst.png")) == pytest.approx(len(both) / 2, rel=0.1)
 
 
-def test_other_photos_of_the_same_thing(run: Path, tmp_path: Path):
+def test_evaluate_other_photos_uses_them(run: Path, tmp_path: Path):
     save_npz(bricks(size=24, train_views=4, val_views=3), tmp_path / "other.npz")
     found = evaluated(run, photos=tmp_path / "other.npz")
     assert len(found["views"]) == 3 and found["scene"]["resolution"] == [24, 24]
 
 
-def test_pictures_too(tmp_path: Path):
+def test_evaluate_image_run_reports_psnr(tmp_path: Path):
     given = ["+experiment=smoke_2d", "dataset.max_side=32", "budget.steps=2", "~logger"]
-    train(composed([*given, "callbacks.pictures=null"], tmp_path))
+    train(compose_config([*given, "callbacks.pictures=null"], tmp_path))
     (view,) = evaluated(tmp_path)["views"]
     results = json.loads((tmp_path / "results.json").read_text())
     assert view["psnr"] == pytest.approx(results["psnr"], abs=0.02)
 
 
-def test_figures_that_a_view_lacks_have_no_mean():
-    views = pd.DataFrame([(20.0, math.nan, math.nan, 1.0), (30.0, 0.5, math.nan, 3.0)], columns=list(DIGITS))
+def test_to_json_missing_metric_has_no_mean():
+    views = pd.DataFrame([(20.0, math.nan, math.nan, 1.0), (30.0, 0.5, math.nan, 3.0)], columns=list(TABLE_DECIMALS))
     mean = to_json(views, Path("run"), {}, CPU)["mean"]
     assert mean == {"psnr": 25.0, "ssim": None, "lpips": None, "seconds": 2.0}
     assert format_table(views).splitlines()[1].split() == ["0", "20.00", "-", "-", "1.000", "<-", "worst"]
 
 
-def test_load_lpips_says_what_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+def test_load_lpips_missing_weights_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
     image = torch.ones(80, 100, 3)
     monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
     assert math.isnan(load_lpips()(image, image)) and "pip install 'nerf_lightning[lpips]'" in capsys.readouterr().out

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from nerf_lightning.cli.evaluate import evaluate
-from nerf_lightning.config.compose import composed
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.dataset import RayDataModule, Scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.bricks import bricks
@@ -26,8 +26,8 @@ def results(folder: Path) -> dict:
     return json.loads((folder / "results.json").read_text())
 
 
-def test_its_figures_stand_beside_those_of_held_out_views(scene: Scene, tmp_path: Path, monkeypatch, capsys):
-    train(composed(OPTIONS, tmp_path), scene=scene)
+def test_evaluate_test_split_reports_separate_metrics(scene: Scene, tmp_path: Path, monkeypatch, capsys):
+    train(compose_config(OPTIONS, tmp_path), scene=scene)
     found = results(tmp_path)
     test = found["test"]
     assert (test["views"], test["views_in_split"]) == (5, 5) and found["scene"]["views"] == {
@@ -40,7 +40,7 @@ def test_its_figures_stand_beside_those_of_held_out_views(scene: Scene, tmp_path
         in capsys.readouterr().out
     )
 
-    monkeypatch.setattr("nerf_lightning.runs.data.data_again", lambda *given: RayDataModule(scene))
+    monkeypatch.setattr("nerf_lightning.runs.reload.reload_data", lambda *given: RayDataModule(scene))
     for split, expected in (("val", found), ("test", test)):
         judged = evaluate(tmp_path, split=split)
         assert judged["mean"]["psnr"] == pytest.approx(expected["psnr"], abs=0.02)
@@ -50,6 +50,6 @@ def test_its_figures_stand_beside_those_of_held_out_views(scene: Scene, tmp_path
 
 
 @pytest.mark.parametrize(("split", "words"), [("test", "have no test split"), ("all", "one of val, test")])
-def test_another_split_is_refused(split: str, words: str, scene: Scene, small_run: Path, tmp_path: Path):
+def test_evaluate_unknown_split_raises(split: str, words: str, scene: Scene, small_run: Path, tmp_path: Path):
     with pytest.raises(InputError, match=words):
         evaluate(small_run, split=split, output=tmp_path)

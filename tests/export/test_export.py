@@ -17,10 +17,10 @@ from nerf_lightning.cli.export import (
     export_transforms,
     export_voxels,
 )
-from nerf_lightning.config.compose import composed
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.errors import InputError
 from nerf_lightning.training.train import train
-from tests.helpers.run_results import results
+from tests.helpers.run_results import make_results
 
 
 def read_about(page: Path) -> dict[str, Any]:
@@ -36,7 +36,8 @@ def planes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("planes")
     size = ["dataset.size=16", "dataset.train_views=8", "dataset.val_views=1", "dataset.rays=64"]
     train(
-        composed(["recipe=tensorf_small", *size, "budget.steps=10", "callbacks.orbit.frames=4"], folder), folder=folder
+        compose_config(["recipe=tensorf_small", *size, "budget.steps=10", "callbacks.orbit.frames=4"], folder),
+        folder=folder,
     )
     return folder
 
@@ -49,25 +50,27 @@ def sweep(planes: Path, tmp_path: Path) -> Path:
     broken = tmp_path / "sweep" / "broken"
     broken.mkdir()
     (broken / "config.yaml").write_text((planes / "config.yaml").read_text())
-    (broken / "results.json").write_text(json.dumps(results(status="interrupted")))
+    (broken / "results.json").write_text(json.dumps(make_results(status="interrupted")))
     return tmp_path / "sweep"
 
 
 def test_export_html_of_a_run_and_of_its_compact_file(planes: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     run = shutil.copytree(planes, tmp_path / "run")
-    page = export_html(run, loss_db=3.0, device="cpu")
+    page = export_html(run, max_psnr_drop=3.0, device="cpu")
     assert page == run / "field.html" and "held-out PSNR" in capsys.readouterr().out
     about = read_about(page)
     facts = dict(about["facts"])
     assert facts["held-out PSNR"].endswith(" dB") and facts["training"].endswith("10 steps")
     assert len(about["photos"]["names"]) > 1
-    alone = read_about(export_html(export_compact(run, loss_db=3.0, device="cpu"), output=tmp_path / "alone.html"))
+    alone = read_about(
+        export_html(export_compact(run, max_psnr_drop=3.0, device="cpu"), output=tmp_path / "alone.html")
+    )
     assert "without photos" in capsys.readouterr().out
     assert alone["photos"] is None and alone["orbit"] == about["orbit"]
 
 
-def test_export_html_all_shows_the_runs_of_a_folder_side_by_side(sweep: Path, capsys: pytest.CaptureFixture[str]):
-    gallery = export_html(sweep, all=True, loss_db=3.0, device="cpu")
+def test_export_html_all_writes_gallery(sweep: Path, capsys: pytest.CaptureFixture[str]):
+    gallery = export_html(sweep, all=True, max_psnr_drop=3.0, device="cpu")
     out = capsys.readouterr().out
     assert "left out: " in out and "2 fields side by side" in out
     assert re.findall(r'<iframe sandbox="allow-scripts"[^>]* src="([^"]*)"', gallery.read_text("utf-8")) == [
@@ -75,11 +78,11 @@ def test_export_html_all_shows_the_runs_of_a_folder_side_by_side(sweep: Path, ca
         "second/field.html",
     ]
     before = (sweep / "second/field.html").stat().st_mtime_ns
-    export_html(sweep, all=True, loss_db=3.0, device="cpu")
+    export_html(sweep, all=True, max_psnr_drop=3.0, device="cpu")
     assert (sweep / "second/field.html").stat().st_mtime_ns == before, "a page that is there is kept"
 
 
-def test_export_shapes_and_photos_are_written_by_their_suffix(planes: Path, tmp_path: Path):
+def test_export_writes_format_of_suffix(planes: Path, tmp_path: Path):
     box = (-9.0, -9.0, -9.0, 9.0, 9.0, 9.0)
     given: dict[str, Any] = {"resolution": 12, "device": "cpu"}
     mesh = export_mesh(planes, output=tmp_path / "it's a mesh, (1).glb", threshold=0.001, box=box, **given)
@@ -100,7 +103,7 @@ def test_export_shapes_and_photos_are_written_by_their_suffix(planes: Path, tmp_
         (export_mesh, {"box": (0, 0, 0, 1, -1, 1)}, "box: found 0 0 0 1 -1 1"),
     ],
 )
-def test_export_bad_options_are_refused(export: Any, given: dict[str, Any], message: str, planes: Path):
+def test_export_bad_options_raise(export: Any, given: dict[str, Any], message: str, planes: Path):
     before = sorted(planes.rglob("*"))
     with pytest.raises(InputError, match=message):
         export(planes, **given)

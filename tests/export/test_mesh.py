@@ -11,9 +11,9 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.mesh import mesh_file, points_file, voxels_file
+from nerf_lightning.export.mesh import build_mesh_file, build_points_file, build_voxels_file
 from nerf_lightning.export.volume import sample_volume
-from tests.helpers.ball_runs import CENTRE, DENSE, RADIUS, ball_run
+from tests.helpers.ball_runs import CENTRE, MAX_DENSITY, RADIUS, make_ball_run
 
 UTM = torch.tensor([5e5, 5.4112e6, 300.0], dtype=torch.float64)
 """Metres, as georeferenced files have coordinates."""
@@ -41,10 +41,10 @@ def lay_down(vertices: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".stl"])
-def test_mesh_file_is_in_the_photos_own_frame(suffix: str):
-    run = ball_run(to_source())
-    shape = mesh_file(run, run.orbit, sample_volume(run, RESOLUTION), None, suffix)
-    assert "watertight" in shape.words
+def test_build_mesh_file_is_in_source_frame(suffix: str):
+    run = make_ball_run(to_source())
+    shape = build_mesh_file(run, run.orbit, sample_volume(run, RESOLUTION), None, suffix)
+    assert "watertight" in shape.description
     mesh = trimesh.load(io.BytesIO(shape.content), file_type=suffix.removeprefix("."), force="mesh")
     vertices = np.asarray(mesh.vertices)
     if suffix == ".glb":
@@ -63,19 +63,19 @@ def test_mesh_file_is_in_the_photos_own_frame(suffix: str):
 
 def read_vertices(suffix: str, shift: torch.Tensor) -> np.ndarray:
     """Vertices as another library reads them."""
-    run = ball_run(to_source())
+    run = make_ball_run(to_source())
     run.to_source[:3, 3] += shift
     volume = sample_volume(run, RESOLUTION)
     if suffix == "points":
-        shape, suffix = points_file(run, run.orbit, volume, None), ".ply"
+        shape, suffix = build_points_file(run, run.orbit, volume, None), ".ply"
     else:
-        shape = mesh_file(run, run.orbit, volume, None, suffix)
+        shape = build_mesh_file(run, run.orbit, volume, None, suffix)
     loaded = trimesh.load(io.BytesIO(shape.content), file_type=suffix.removeprefix("."), process=False)
     return np.asarray(loaded.to_mesh().vertices if isinstance(loaded, trimesh.Scene) else loaded.vertices)
 
 
 @pytest.mark.parametrize("suffix", [".ply", "points", ".obj", ".glb"])
-def test_mesh_file_georeferenced_vertices_are_as_exact_as_at_the_origin(suffix: str):
+def test_build_mesh_file_georeferenced_vertices_keep_precision(suffix: str):
     """In UTM coordinates single precision would leave steps of half a metre."""
     near, far = read_vertices(".ply", torch.zeros(3)), read_vertices(suffix, UTM)
     far = (lay_down(far) if suffix == ".glb" else far) - UTM.numpy()
@@ -84,13 +84,13 @@ def test_mesh_file_georeferenced_vertices_are_as_exact_as_at_the_origin(suffix: 
         assert cKDTree(some).query(others)[0].max() < 1e-6 * size
 
 
-def test_mesh_file_georeferenced_stl_is_refused():
+def test_build_mesh_file_georeferenced_stl_raises():
     with pytest.raises(InputError, match=r"found .stl for coordinates up to 5.4112e\+06"):
         read_vertices(".stl", UTM)
 
 
-def test_sample_volume_of_box_cuts_georeferenced_cells_where_it_is():
-    run = ball_run(to_source())
+def test_sample_volume_georeferenced_box_crops_cells():
+    run = make_ball_run(to_source())
     near = sample_volume(run, RESOLUTION, box := torch.tensor([[4.99, -1.005, 1.99], [5.006, -0.992, 2.01]]).double())
     run.to_source[:3, 3] += UTM
     far = sample_volume(run, RESOLUTION, box + UTM)
@@ -99,42 +99,44 @@ def test_sample_volume_of_box_cuts_georeferenced_cells_where_it_is():
     assert near.density.shape == (40, 33, 27), "the box, in cells of the scene"
 
 
-def test_voxels_file_holds_density_colour_and_place():
-    run = ball_run(to_source())
-    with np.load(io.BytesIO(voxels_file(run, sample_volume(run, RESOLUTION)).content)) as file:
+def test_build_voxels_file_contains_density_colour_and_transform():
+    run = make_ball_run(to_source())
+    with np.load(io.BytesIO(build_voxels_file(run, sample_volume(run, RESOLUTION)).content)) as file:
         density, rgb, place = file["density"], file["rgb"], file["to_source"]
     assert density.shape == (RESOLUTION,) * 3 and rgb.shape == (*density.shape, 3)
-    index = np.argwhere(density * SCALE > DENSE / 2)
+    index = np.argwhere(density * SCALE > MAX_DENSITY / 2)
     places = index @ place[:3, :3].T + place[:3, 3]
     np.testing.assert_allclose(places.mean(0), there(CENTRE), atol=SCALE * 0.01)
     assert np.linalg.norm(places - there(CENTRE), axis=1).max() < SCALE * (RADIUS + 0.01)
-    assert density.max() * SCALE == pytest.approx(DENSE, rel=0.01), "per unit of the photos' frame"
+    assert density.max() * SCALE == pytest.approx(MAX_DENSITY, rel=0.01), "per unit of the photos' frame"
 
 
-def test_sample_volume_of_box_cuts_and_has_finer_cells():
-    run = ball_run(to_source())
+def test_sample_volume_box_has_finer_cells():
+    run = make_ball_run(to_source())
     middle = there(CENTRE)
     reach = 0.7 * SCALE
     box = torch.tensor(np.stack([middle - reach, middle + [reach, reach, 0]]), dtype=torch.float32)
     volume = sample_volume(run, RESOLUTION, box)
     assert volume.cell == pytest.approx(1.4 / RESOLUTION, rel=1e-4)
-    mesh = trimesh.load(io.BytesIO(mesh_file(run, run.orbit, volume, 0.5, ".ply").content), file_type="ply")
+    mesh = trimesh.load(io.BytesIO(build_mesh_file(run, run.orbit, volume, 0.5, ".ply").content), file_type="ply")
     low, high = mesh.bounds
     cell = SCALE * volume.cell
     assert abs(high[2] - middle[2]) < cell and abs(low[2] - (middle[2] - SCALE * RADIUS)) < 1.5 * cell
     assert mesh.is_watertight, "closed where it was cut"
 
 
-def test_sample_volume_of_a_box_outside_the_scene_is_refused():
+def test_sample_volume_box_outside_scene_raises():
     message = r"export: box: found \[-2.0.*expected something within \[4.98.* the scene's box"
     with pytest.raises(InputError, match=message):
-        sample_volume(ball_run(to_source()), RESOLUTION, torch.tensor([[-2.0] * 3, [-1.0] * 3]))
+        sample_volume(make_ball_run(to_source()), RESOLUTION, torch.tensor([[-2.0] * 3, [-1.0] * 3]))
 
 
 def test_sample_volume_cells_are_cubic():
-    run = ball_run(torch.eye(4))
+    run = make_ball_run(torch.eye(4))
     aabb = torch.tensor([[-1.0, -0.5, -0.26], [1.0, 0.5, 0.26]])
-    run.system.field.bounds = replace(run.system.field.bounds, aabb=aabb, pixel=0.02)
+    run.system.field.bounds = replace(run.system.field.bounds, aabb=aabb, pixel_footprint=0.02)
     volume = sample_volume(run, 20)
     assert volume.density.shape == (20, 10, 6) and sample_volume(run).density.shape[0] == 80
-    torch.testing.assert_close(volume.places(torch.tensor([[9.5, 4.5, 2.5]]))[0], torch.zeros(3), atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        volume.index_to_world(torch.tensor([[9.5, 4.5, 2.5]]))[0], torch.zeros(3), atol=1e-6, rtol=0
+    )

@@ -6,9 +6,14 @@ import torch
 import trimesh
 
 from nerf_lightning.errors import InputError
-from nerf_lightning.export.surface import box_around, find_surface, lit_cells, solid_from
+from nerf_lightning.export.surface import (
+    compute_otsu_threshold,
+    extract_surface,
+    fill_bounding_box,
+    find_unoccluded_cells,
+)
 from nerf_lightning.export.volume import Volume, sample_volume
-from tests.helpers.ball_runs import CENTRE, RADIUS, ball_run
+from tests.helpers.ball_runs import CENTRE, RADIUS, make_ball_run
 
 N, CELL, SOFT, DENSE = 40, 0.05, 0.02, 60.0
 LIT = np.ones((N, N, N), bool)
@@ -26,14 +31,14 @@ def volume(*balls: tuple[tuple[float, float, float], float]) -> Volume:
 
 
 def mesh_of(one: Volume, threshold: float | None = None) -> trimesh.Trimesh:
-    surface = find_surface(one, LIT, threshold)
+    surface = extract_surface(one, LIT, threshold)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
     away = surface.vertices - surface.vertices.mean(0)
     assert (np.einsum("ij,ij->i", away, surface.normals) > 0).mean() > 0.99, "normals point outwards"
     return mesh
 
 
-def test_a_ball_is_round_closed_and_full():
+def test_extract_surface_ball_is_watertight():
     mesh = mesh_of(volume(((0.1, 0.0, -0.2), 0.7)), 0.5)
     radius = np.linalg.norm(mesh.vertices - [0.1, 0.0, -0.2], axis=1)
     share = -np.log(0.5) / (DENSE * CELL)  # of the full density where a cell's opacity is one half
@@ -43,48 +48,48 @@ def test_a_ball_is_round_closed_and_full():
     assert mesh.volume == pytest.approx(4 / 3 * np.pi * expected**3, rel=0.05), "triangles face outwards"
 
 
-def test_small_pieces_float_and_are_left_out_but_others_stay():
+def test_extract_surface_removes_only_floaters():
     one = volume(((-0.3, 0, 0), 0.5), ((0.7, 0.7, 0.7), 0.05), ((0.6, 0, 0), 0.25))
-    surface = find_surface(one, LIT, 0.5)
+    surface = extract_surface(one, LIT, 0.5)
     assert surface.floaters == 1
     assert trimesh.Trimesh(surface.vertices, surface.faces).body_count == 2
 
 
-def test_the_threshold_stands_between_the_thin_and_the_dense():
+def test_compute_otsu_threshold_separates_haze_from_solid():
     generator = np.random.default_rng(0)
     thin, dense = generator.normal(0.15, 0.03, 4000), generator.normal(0.9, 0.02, 1000)
-    assert 0.3 < solid_from(np.concatenate([thin, dense]).clip(0, 1)) < 0.8
+    assert 0.3 < compute_otsu_threshold(np.concatenate([thin, dense]).clip(0, 1)) < 0.8
     blurred = generator.uniform(0.1, 0.9, 1500)
     haze = generator.uniform(0.02, 0.08, 40000)
-    assert 0.3 < solid_from(np.concatenate([haze, blurred, dense]).clip(0, 1)) < 0.8, "not within the haze"
-    assert solid_from(np.zeros(0)) == 0.5 and solid_from(np.full(3, 0.6)) == 0.3
-    assert solid_from(np.array([0.2, 0.2, 0.8])) == pytest.approx(0.5)
+    assert 0.3 < compute_otsu_threshold(np.concatenate([haze, blurred, dense]).clip(0, 1)) < 0.8, "not within the haze"
+    assert compute_otsu_threshold(np.zeros(0)) == 0.5 and compute_otsu_threshold(np.full(3, 0.6)) == 0.3
+    assert compute_otsu_threshold(np.array([0.2, 0.2, 0.8])) == pytest.approx(0.5)
     fog = volume(((0, 0, 0), 0.5))
     fog.density.clamp_(min=0.3)  # a haze all over the box, which stops a quarter of the light on its way to the middle
     mesh = mesh_of(fog)
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.5).max() < 2 * CELL
 
 
-def test_nothing_there_is_told():
+def test_extract_surface_empty_volume_raises():
     with pytest.raises(InputError, match="nothing above an opacity of 0.90 a cell, expected at most 0.00"):
-        find_surface(Volume(torch.zeros(N, N, N), LOW, CELL), LIT, 0.9)
+        extract_surface(Volume(torch.zeros(N, N, N), LOW, CELL), LIT, 0.9)
 
 
-def test_what_no_camera_sees_is_solid_and_what_one_sees_is_not():
-    run = ball_run(torch.eye(4))
+def test_extract_surface_occluded_cells_are_solid():
+    run = make_ball_run(torch.eye(4))
     one = sample_volume(run, N)
-    lit = lit_cells(run.system, one, run.orbit)
+    unoccluded = find_unoccluded_cells(run.system, one, run.orbit)
     radius = (one.centres - CENTRE).norm(dim=-1).numpy()
-    assert not lit[radius < RADIUS - 2.5 * one.cell].any()
-    in_view = lit[(radius > RADIUS + 2 * one.cell) & (radius < RADIUS + 4 * one.cell)]
+    assert not unoccluded[radius < RADIUS - 2.5 * one.cell].any()
+    in_view = unoccluded[(radius > RADIUS + 2 * one.cell) & (radius < RADIUS + 4 * one.cell)]
     assert in_view.mean() > 0.95
     hollow = Volume(torch.where(torch.from_numpy(radius) < RADIUS - 3 * one.cell, 0.0, one.density), one.low, one.cell)
-    inside = find_surface(hollow, lit, 0.5)
+    inside = extract_surface(hollow, unoccluded, 0.5)
     away = np.linalg.norm(inside.vertices - CENTRE.numpy(), axis=1)
     assert (away > RADIUS - one.cell).all(), "its inner side stays unseen"
 
 
-def test_the_dark_below_a_floor_is_not_solid():
+def test_extract_surface_occluded_cells_below_floor_stay_empty():
     floor = np.zeros((6, 6, 6), bool)
     floor[1:5, 1:5, 3] = True
-    assert box_around(floor).sum() == 16 and not box_around(np.zeros((2, 2, 2), bool)).any()
+    assert fill_bounding_box(floor).sum() == 16 and not fill_bounding_box(np.zeros((2, 2, 2), bool)).any()

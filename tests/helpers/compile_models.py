@@ -17,12 +17,12 @@ from torch._dynamo.utils import counters
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.config.compose import composed
-from nerf_lightning.kernels import use_kernels
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.kernels import set_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import Samples
-from nerf_lightning.system.compiled import part
+from nerf_lightning.system.torch_compile import maybe_compile
 from nerf_lightning.training import train as training
 from tests.helpers.growth import grow
 from tests.helpers.train_models import MODELS
@@ -30,23 +30,27 @@ from tests.helpers.train_models import MODELS
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 FIELDS = {
     "mlp": lambda: MLPField(BOX, depth=2, width=8, skip=1, position_frequencies=2, density="exp"),
-    "hashgrid": lambda: HashGridField(BOX, levels=3, log2_entries=8, coarsest=3, finest=12, width=8),
-    "tensorf": lambda: TensoRFField(BOX, 4, 4, coarsest=6, finest=10, stages=2, width=8),
-    "voxels": lambda: VoxelField(BOX, coarsest=6, finest=10, stages=2),
+    "hashgrid": lambda: HashGridField(
+        BOX, num_levels=3, log2_hashmap_size=8, base_resolution=3, max_resolution=12, width=8
+    ),
+    "tensorf": lambda: TensoRFField(BOX, 4, 4, base_resolution=6, max_resolution=10, stages=2, width=8),
+    "voxels": lambda: VoxelField(BOX, base_resolution=6, max_resolution=10, stages=2),
 }
-SIZES = ((5, 13, 0.0), (40, 300, 0.0), (7, 90, 1.0), (6, 40, 1.0))
+GROWTH_CASES = ((5, 13, 0.0), (40, 300, 0.0), (7, 90, 1.0), (6, 40, 1.0))
 """Rays and samples, and the progress to which a field grows before."""
 
 
-def outcome(field: Field, renderer: VolumeRenderer | None, rays: Rays, samples: Samples, backend: str | None) -> list:
+def evaluate_field(
+    field: Field, renderer: VolumeRenderer | None, rays: Rays, samples: Samples, backend: str | None
+) -> list:
     """What a step asks of a field, with the renderer where there is one, and the gradients."""
     field.zero_grad()
     with torch.no_grad():
-        density = part(field.density, backend)(rays.origins)
+        density = maybe_compile(field.density, backend)(rays.origins)
     if renderer is None:
-        values = part(field.forward, backend)(samples.positions(rays), samples.directions(rays))[:2]
+        values = maybe_compile(field.forward, backend)(samples.positions(rays), samples.directions(rays))[:2]
     else:
-        rendered = part(renderer.forward, backend)(rays, samples, field, torch.ones(len(rays), 3))
+        rendered = maybe_compile(renderer.forward, backend)(rays, samples, field, torch.ones(len(rays), 3))
         values = rendered.rgb, rendered.opacity
     sum(value.square().sum() for value in values).backward()
     gradients = [parameter.grad.clone() for parameter in field.parameters() if parameter.grad is not None]
@@ -57,14 +61,14 @@ def check_field(name: str, backend: str) -> dict[str, float]:
     """The largest difference, of the largest value in its tensor, and how many graphs were made at first, and anew."""
     field, renderer = FIELDS[name](), VolumeRenderer() if name == "mlp" else None  # the same for all
     keys, worst, before, graphs = list(field.state_dict()), 0.0, counters["stats"]["unique_graphs"], []
-    for rays, count, progress in SIZES:
+    for rays, count, progress in GROWTH_CASES:
         grow(field, progress)
         ray = torch.randint(0, rays, (count,)).sort().values
         bundle = Rays(torch.rand(rays, 3) - 0.5, normalize(torch.randn(rays, 3), dim=1))
         offsets = torch.searchsorted(ray, torch.arange(rays + 1))
         samples = Samples(torch.rand(count), torch.rand(count) / 10, ray, offsets)
-        expected = outcome(field, renderer, bundle, samples, None)
-        found = outcome(field, renderer, bundle, samples, backend)
+        expected = evaluate_field(field, renderer, bundle, samples, None)
+        found = evaluate_field(field, renderer, bundle, samples, backend)
         assert len(found) == len(expected)
         for one, other in zip(found, expected, strict=True):
             assert one.shape == other.shape
@@ -78,16 +82,16 @@ def check_field(name: str, backend: str) -> dict[str, float]:
 
 def train(folder: Path, backend: str) -> list[float]:
     """The held-out PSNR of a small run, compiled and not."""
-    training.BACKEND = backend
+    training.COMPILE_BACKEND = backend
     options = [*MODELS["siren"], "model=siren", "model.depth=1", "budget.steps=30", "callbacks.snapshots=null"]
     options += ["device=cpu", "kernels=reference", "~logger"]
-    return [training.train(composed([*options, f"compile={on}"], folder / on)) for on in ("true", "false")]
+    return [training.train(compose_config([*options, f"compile={on}"], folder / on)) for on in ("true", "false")]
 
 
 if __name__ == "__main__":
     warnings.filterwarnings("error", category=UserWarning)
     torch.manual_seed(0)
-    use_kernels("reference")
+    set_kernels("reference")
     backend, *names = sys.argv[1:]
     folder = Path(names.pop()) if "--train" in names else None
     found: dict[str, object] = {"fields": {name: check_field(name, backend) for name in names if name in FIELDS}}

@@ -4,7 +4,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 
-def tags(
+def encode_exif(
     orientation: int = 1,
     make: str = "",
     model: str = "",
@@ -17,7 +17,7 @@ def tags(
     """EXIF, without the tags that are empty or 0; focal lengths in millimetres."""
     exif = Image.Exif()
     details = exif.get_ifd(0x8769)
-    for place, tag, value in (
+    for target, tag, value in (
         (exif, 0x0112, orientation),
         (exif, 0x010F, make),
         (exif, 0x0110, model),
@@ -28,5 +28,5 @@ def tags(
         (details, 0x8827, speed),
     ):
         if value:
-            place[tag] = value
+            target[tag] = value
     return exif.tobytes()

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 from typing import Any
 
-from nerf_lightning.runs.index import Run
+from nerf_lightning.runs.summaries import RunSummary
 
-MakeRun = Callable[..., Run]
+MakeRun = Callable[..., RunSummary]
 
 
-def results(**changes: Any) -> dict[str, Any]:
+def make_results(**changes: Any) -> dict[str, Any]:
     """A results.json as a run writes it, with some entries changed."""
     scene = {
         "name": "toy",

@@ -13,8 +13,8 @@ from unittest.mock import patch
 import torch
 
 from nerf_lightning.callbacks import Checkpoints
-from nerf_lightning.config.compose import composed
-from nerf_lightning.system import photos, trial
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.system import correction_trial, photo_quality
 from nerf_lightning.training.train import train
 
 SCENE = [
@@ -25,11 +25,24 @@ PICTURE = [
     *("+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.pictures=null"),
 ]
 MODELS = {
-    "hashgrid": [*SCENE, "refine=auto", "model.levels=3", "model.finest=32", "model.log2_entries=10", "model.width=16"],
-    "voxels": [*SCENE, "recipe=voxels_small", "model.coarsest=8", "model.finest=16", "model.grown=1"],
+    "hashgrid": [
+        *SCENE,
+        "refine=auto",
+        "model.num_levels=3",
+        "model.max_resolution=32",
+        "model.log2_hashmap_size=10",
+        "model.width=16",
+    ],
+    "voxels": [
+        *SCENE,
+        "recipe=voxels_small",
+        "model.base_resolution=8",
+        "model.max_resolution=16",
+        "model.growth_end=1",
+    ],
     "tensorf": [
         *(*SCENE, "refine=both", "refine.focal=true", "refine.affine=true", "refine.vignetting=true"),
-        *("recipe=tensorf_small", "model.coarsest=8", "model.finest=16", "model.grown=1"),
+        *("recipe=tensorf_small", "model.base_resolution=8", "model.max_resolution=16", "model.growth_end=1"),
     ],
     "mlp": [*SCENE, "recipe=mlp_small", "model.width=16"],
     "hashgrid2d": PICTURE,
@@ -37,50 +50,50 @@ MODELS = {
     "fourier": [*PICTURE, "model.width=32"],
     "siren": [*PICTURE, "model.width=32"],
 }
-ANOTHER = "siren, another seed"
-STEPS = 14
+OTHER_SEED = "siren, another seed"
+NUM_STEPS = 14
 
 
-photos.STEPS_TOGETHER = photos.STEPS_APART = 1  # held-out photos are not what is compared
+photo_quality.JOINT_STEPS = photo_quality.PER_CAMERA_STEPS = 1  # held-out photos are not what is compared
 
 
-class Stop(Exception):
+class StopTraining(Exception):
     """Training is to end here."""
 
 
-@patch.dict(trial.MIN_GAIN, poses=-1.0, light=-1.0)  # refine=auto begins with its first trial
-@patch.multiple(trial, FIRST_TRIAL_STEP=2, EARLY_STEPS=2)
-def fingerprints(folder: Path, stop: int) -> dict[str, str]:
+@patch.dict(correction_trial.MIN_ERROR_REDUCTION, poses=-1.0, exposure=-1.0)  # refine=auto begins with its first trial
+@patch.multiple(correction_trial, FIRST_TRIAL_STEP=2, EARLY_TRIAL_STEPS=2)
+def train_fingerprints(folder: Path, stop: int) -> dict[str, str]:
     save = Checkpoints.on_train_batch_end
 
     def save_and_stop(self: Checkpoints, trainer: Any, *rest: Any) -> None:
         save(self, trainer, *rest)
         if trainer.global_step == stop:
             self.save(trainer, "last.ckpt")
-            raise Stop
+            raise StopTraining
 
     prints = {}
-    for name in [*MODELS, ANOTHER]:
-        model, seed, run = name.partition(",")[0], int(name == ANOTHER), folder / name
-        options = [f"model={model}", f"seed={seed}", "threads=2", f"budget.steps={STEPS}", "~logger"]
-        cfg = composed([*MODELS[model], *options], run)
+    for name in [*MODELS, OTHER_SEED]:
+        model, seed, run = name.partition(",")[0], int(name == OTHER_SEED), folder / name
+        options = [f"model={model}", f"seed={seed}", "threads=2", f"budget.steps={NUM_STEPS}", "~logger"]
+        cfg = compose_config([*MODELS[model], *options], run)
         last = run / "checkpoints" / "last.ckpt"
         if stop:
             Checkpoints.on_train_batch_end = save_and_stop  # type: ignore[method-assign]
             try:
                 train(cfg)
-            except Stop:
+            except StopTraining:
                 Checkpoints.on_train_batch_end = save  # type: ignore[method-assign]
             assert json.loads((run / "results.json").read_text())["steps"] == stop
         train(cfg, last if stop else None)
-        prints[name] = fingerprint(run / "checkpoints" / "last.ckpt")
+        prints[name] = hash_weights(run / "checkpoints" / "last.ckpt")
     return prints
 
 
-def fingerprint(checkpoint: Path) -> str:
+def hash_weights(checkpoint: Path) -> str:
     """Of all weights and buffers, bit by bit."""
     state = torch.load(checkpoint, weights_only=True)
-    assert state["global_step"] == STEPS
+    assert state["global_step"] == NUM_STEPS
     digest = hashlib.sha256()
     for key, value in sorted(state["state_dict"].items()):
         digest.update(f"{key} {tuple(value.shape)} {value.dtype}".encode() + value.numpy().tobytes())
@@ -88,4 +101,4 @@ def fingerprint(checkpoint: Path) -> str:
 
 
 if __name__ == "__main__":
-    print(json.dumps(fingerprints(Path(sys.argv[1]), int(sys.argv[2]))))
+    print(json.dumps(train_fingerprints(Path(sys.argv[1]), int(sys.argv[2]))))

@@ -14,15 +14,15 @@ from torch.nn.functional import normalize
 
 from nerf_lightning import kernels as k
 from nerf_lightning.cameras import Bounds, Rays
-from tests.helpers.assert_close import assert_agrees, values_and_gradients
-from tests.helpers.ragged_samples import MANY, ragged_samples
+from tests.helpers.kernel_comparison import assert_matches_reference, values_and_gradients
+from tests.helpers.ragged_samples import BUNDLE, make_ragged_samples
 
 DRAW = Callable[[st.SearchStrategy], object]
 SAMPLES = st.sampled_from([0, 1, 2, 128, 700])
 """None, one, and more than fit one block of a kernel."""
-COUNTS = st.one_of(st.lists(st.integers(0, 7), max_size=6), st.just(MANY))
+COUNTS = st.one_of(st.lists(st.integers(0, 7), max_size=6), st.just(BUNDLE))
 """How many samples each ray holds."""
-AROUND = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
+UNBOUNDED = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 HASH_GRIDS = [
     ([(3, 3, 3)], [64]),
     ([(2, 2, 2)], [32]),
@@ -45,13 +45,13 @@ class Case:
     """Inputs without a gradient."""
     rtol: float = 1e-4
     atol: float = 1e-6
-    any_threads: bool = True
+    same_with_any_threads: bool = True
     spoilt: int | None = None
     """An input whose values that are not numbers must show."""
 
 
 def packed(counts: list[int]) -> tuple[Tensor, ...]:
-    samples = ragged_samples(counts)
+    samples = make_ragged_samples(counts)
     return samples.t, samples.dt, samples.ray, samples.offsets
 
 
@@ -67,24 +67,24 @@ def composite(draw: DRAW) -> Case:
     return Case(call, [density, torch.rand(3, len(t))], spoilt=1)
 
 
-def keep_visible(draw: DRAW) -> Case:
+def filter_visible(draw: DRAW) -> Case:
     given = packed(draw(COUNTS))
-    thickness = 30 * torch.rand(len(given[0])) * (torch.rand(len(given[0])) < 0.5) * given[1]
-    least, dropped = draw(st.sampled_from([(0.0, math.inf), (0.1, math.inf), (0.1, 0.2)]))
+    optical_depth = 30 * torch.rand(len(given[0])) * (torch.rand(len(given[0])) < 0.5) * given[1]
+    least, max_dropped = draw(st.sampled_from([(0.0, math.inf), (0.1, math.inf), (0.1, 0.2)]))
 
     def call() -> list[Tensor]:
-        kept, which = k.keep_visible(thickness, given, 1e-3, least, dropped=dropped)
+        kept, which = k.filter_visible(optical_depth, given, 1e-3, least, max_dropped=max_dropped)
         return [kept, *which]
 
     return Case(call, [], rtol=0, atol=0)
 
 
-def merge_faint(draw: DRAW) -> Case:
+def merge_low_weight(draw: DRAW) -> Case:
     given = packed(draw(COUNTS))
-    thickness = 2 * torch.rand(len(given[0])) ** 3
+    optical_depth = 2 * torch.rand(len(given[0])) ** 3
 
     def call() -> list[Tensor]:
-        merged, which = k.merge_faint(thickness, given, 0.1)
+        merged, which = k.merge_low_weight(optical_depth, given, 0.1)
         return [merged, *which]
 
     return Case(call, [], rtol=1.3e-6, atol=1e-5)
@@ -121,7 +121,7 @@ def mlp(draw: DRAW) -> Case:
         return list(k.mlp_heads(x.T, layers, first, extra.T if further else None)[head])
 
     inputs = [torch.randn(further, samples), torch.randn(widths[0], samples), *flat]
-    return Case(call, inputs, (0,), atol=1e-5, any_threads=False, spoilt=1)
+    return Case(call, inputs, (0,), atol=1e-5, same_with_any_threads=False, spoilt=1)
 
 
 def planes(draw: DRAW) -> Case:
@@ -138,10 +138,10 @@ def planes(draw: DRAW) -> Case:
     )
 
 
-def points(draw: DRAW) -> Case:
+def ray_positions(draw: DRAW) -> Case:
     ray, t = torch.randint(0, 40, (draw(SAMPLES),)), draw(st.sampled_from([5.0, 500.0]))
     given = [torch.randn(40, 3), directions(40), ray, t * torch.rand(len(ray))]
-    return Case(k.points, given, draw(st.sampled_from([(), (3,), (0, 1, 3)])), atol=3e-6, spoilt=3)
+    return Case(k.ray_positions, given, draw(st.sampled_from([(), (3,), (0, 1, 3)])), atol=3e-6, spoilt=3)
 
 
 def voxels(draw: DRAW) -> Case:
@@ -150,17 +150,17 @@ def voxels(draw: DRAW) -> Case:
     size = int(index.max()) + 1
     density, colour, views = torch.randn(size), torch.randn(size, 3), torch.randn(size, 3 * terms)
     vertex = torch.cat([torch.tensor([-1]), index.nonzero()[:, 0]]).int()
-    rows, weights = k.locate(index, unit)
+    rows, weights = k.locate_vertices(index, unit)
     basis = k.spherical_harmonics(directions(len(unit)))[:, 1 : 1 + terms]
     return draw(
         st.sampled_from(
             [
-                Case(k.locate, [index, unit], spoilt=1),
-                Case(k.voxel_value, [density, index, unit], (0, 2), spoilt=2),
-                Case(k.voxel_value, [density, index, unit], (2,), spoilt=2),
-                Case(k.read_voxels, [density, colour, views, rows, weights, basis], (5,), atol=3e-6, spoilt=4),
-                Case(lambda values: k.roughness(values, vertex, index, 1, size), [density], rtol=1e-5, spoilt=0),
-                Case(lambda values: k.roughness(values, vertex, index, 20, 60), [density], rtol=1e-5, spoilt=0),
+                Case(k.locate_vertices, [index, unit], spoilt=1),
+                Case(k.interpolate_scalar, [density, index, unit], (0, 2), spoilt=2),
+                Case(k.interpolate_scalar, [density, index, unit], (2,), spoilt=2),
+                Case(k.interpolate_voxels, [density, colour, views, rows, weights, basis], (5,), atol=3e-6, spoilt=4),
+                Case(lambda values: k.total_variation(values, vertex, index, 1, size), [density], rtol=1e-5, spoilt=0),
+                Case(lambda values: k.total_variation(values, vertex, index, 20, 60), [density], rtol=1e-5, spoilt=0),
             ]
         )
     )
@@ -169,7 +169,7 @@ def voxels(draw: DRAW) -> Case:
 def march(draw: DRAW) -> Case:
     near, far = draw(st.sampled_from([(None, None), (1.5, None), (2.0, 4.0), (4.0, 2.0), (0.0, 9.0)]))
     unit = draw(st.sampled_from([1e-3, 1.0, 1e3]))  # of length
-    bounds = Bounds(unit * AROUND.aabb, draw(st.booleans()), near and unit * near, far and unit * far)
+    bounds = Bounds(unit * UNBOUNDED.aabb, draw(st.booleans()), near and unit * near, far and unit * far)
     origins = torch.cat([4 * directions(60), 2 * torch.rand(10, 3) - 1, torch.full((1, 3), 5.0)])
     toward = torch.cat([2.8 * torch.rand(70, 3) - 1.4 - origins[:70], torch.ones(1, 3)])
     toward[:9] = torch.cat([torch.eye(3), -torch.eye(3), torch.ones(3, 3)])  # along axes, and the diagonal
@@ -182,23 +182,23 @@ def march(draw: DRAW) -> Case:
 
 
 def proposals(draw: DRAW) -> Case:
-    bounds, s = replace(AROUND, near=0.1, unbounded=draw(st.booleans())), torch.rand(50, 13).sort(1).values
+    bounds, s = replace(UNBOUNDED, near=0.1, unbounded=draw(st.booleans())), torch.rand(50, 13).sort(1).values
     rays = Rays(4 * directions(50), directions(50))
     if draw(st.booleans()):
-        return Case(lambda: k.along(rays, bounds, *bounds.near_far(rays), s), [], rtol=0, atol=0)
+        return Case(lambda: k.interval_midpoints(rays, bounds, *bounds.near_far(rays), s), [], rtol=0, atol=0)
     share, shift = torch.rand(50, 12) * (torch.rand(50, 1) < 0.8), torch.rand(50) - 0.5
     return Case(lambda: k.resample(s, share, shift, 20), [], atol=1e-4)
 
 
-LEARNING = [composite, spherical_harmonics, hash_interpolate, mlp, planes, points, voxels]
+LEARNING = [composite, spherical_harmonics, hash_interpolate, mlp, planes, ray_positions, voxels]
 
 
-@pytest.mark.parametrize("kernel", [*LEARNING, keep_visible, merge_faint, march, proposals])
+@pytest.mark.parametrize("kernel", [*LEARNING, filter_visible, merge_low_weight, march, proposals])
 @given(data=st.data(), seed=st.integers(0, 1000))
 def test_fast_kernel_any_input_matches_reference(kernel: Callable[[DRAW], Case], data: st.DataObject, seed: int):
     torch.manual_seed(seed)
     case = kernel(data.draw)
-    assert_agrees(case.call, case.inputs, case.constants, case.rtol, case.atol, case.any_threads)
+    assert_matches_reference(case.call, case.inputs, case.constants, case.rtol, case.atol, case.same_with_any_threads)
 
 
 @pytest.mark.parametrize("kernel", LEARNING)
@@ -210,7 +210,7 @@ def test_fast_kernel_nan_input_shows_as_in_reference(kernel: Callable[[DRAW], Ca
     spoilt[torch.rand(spoilt.shape) < 0.1] = math.nan
     found = []
     for choice in ("reference", "auto"):
-        k.use_kernels(choice)
+        k.set_kernels(choice)
         found.append(values_and_gradients(case.call, case.inputs, case.constants))
     gradients = sum(x.is_floating_point() and i not in case.constants for i, x in enumerate(case.inputs))
     for number, (expected, got) in enumerate(zip(*found, strict=True)):

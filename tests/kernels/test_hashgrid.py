@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from nerf_lightning.kernels import hash_interpolate, use_kernels
+from nerf_lightning.kernels import hash_interpolate, set_kernels
 
 CASES = {
     "dense, with room": ([(2, 2, 2)], [32]),
@@ -30,7 +30,7 @@ def entry(corner: list[int], cells: tuple[int, ...], size: int) -> int:
     return hashed % 2**32 % size
 
 
-def by_hand(tables: Tensor, unit: Tensor, resolutions: Levels, sizes: list[int]) -> Tensor:
+def brute_force(tables: Tensor, unit: Tensor, resolutions: Levels, sizes: list[int]) -> Tensor:
     """Every level's corners one by one."""
     rows = []
     for point in unit.double().clamp(0, 1).tolist():
@@ -54,9 +54,9 @@ def test_hash_interpolate_any_levels_match_loop_over_corners(cells: Levels, size
     tables, axes = torch.randn(sum(sizes), 2, dtype=torch.float64), len(cells[0])
     ends = torch.tensor([[0.0, 0, 0], [1, 1, 1], [0, 1, 0.5], [1, 0.25, 0], [-0.3, 0.5, 1.2]])
     unit = torch.cat([torch.rand(20, 3), ends])[:, :axes]
-    expected = by_hand(tables, unit, cells, sizes)
+    expected = brute_force(tables, unit, cells, sizes)
     torch.testing.assert_close(hash_interpolate(tables, unit.double(), cells, sizes), expected, atol=1e-9, rtol=1e-9)
     for choice in ("auto", "reference"):
-        use_kernels(choice)
+        set_kernels(choice)
         single = hash_interpolate(tables.float(), unit, cells, sizes)
         torch.testing.assert_close(single.double(), expected, atol=1e-5 + 1e-6 * max(max(cells)), rtol=0)

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.kernels import mlp
-from tests.helpers.assert_close import run_with_threads, values_and_gradients
+from tests.helpers.kernel_comparison import run_with_threads, values_and_gradients
 
 
 def network(widths: tuple[int, ...], further: int = 0) -> list[Tensor]:
@@ -21,7 +21,7 @@ def pairs(flat: tuple[Tensor, ...] | list[Tensor]) -> list[tuple[Tensor, Tensor]
     return list(zip(flat[::2], flat[1::2], strict=True))
 
 
-def by_hand(x: list[float], flat: list[Tensor]) -> list[float]:
+def brute_force(x: list[float], flat: list[Tensor]) -> list[float]:
     layers = pairs(flat)
     for index, (matrix, bias) in enumerate(layers):
         rows = zip(matrix.tolist(), bias.tolist(), strict=True)
@@ -35,7 +35,7 @@ def by_hand(x: list[float], flat: list[Tensor]) -> list[float]:
 )
 def test_mlp_any_widths_match_loop_over_neurons(widths: tuple[int, ...], further: int, kernels: str):
     flat, x, extra = network(widths, further), torch.randn(6, widths[0]), torch.randn(6, further)
-    expected = torch.tensor([by_hand(a + b, flat) for a, b in zip(x.tolist(), extra.tolist(), strict=True)])
+    expected = torch.tensor([brute_force(a + b, flat) for a, b in zip(x.tolist(), extra.tolist(), strict=True)])
     torch.testing.assert_close(mlp(x, pairs(flat), extra), expected, rtol=1e-4, atol=1e-5)
     if not further:
         assert torch.equal(mlp(x, pairs(flat)), mlp(x, pairs(flat), extra))

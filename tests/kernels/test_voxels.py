@@ -3,11 +3,11 @@ import torch
 from torch import Tensor
 
 from nerf_lightning.kernels import (
-    locate,
-    read_voxels,
-    roughness,
+    interpolate_scalar,
+    interpolate_voxels,
+    locate_vertices,
     spherical_harmonics,
-    voxel_value,
+    total_variation,
 )
 
 SIDE = 6
@@ -42,7 +42,7 @@ def basis_of(count: int, terms: int) -> Tensor:
     return spherical_harmonics(directions)[:, 1 : 1 + terms]
 
 
-def by_hand(values: Tensor, index: Tensor, position: list[float]) -> Tensor:
+def brute_force(values: Tensor, index: Tensor, position: list[float]) -> Tensor:
     """All vertices, each with the weight of a tent around it."""
     total = torch.zeros(values.shape[1:], dtype=torch.float64)
     tents = [[max(0.0, 1 - abs(min(max(p, 0.0), 1.0) * (SIDE - 1) - i)) for i in range(SIDE)] for p in position]
@@ -52,21 +52,21 @@ def by_hand(values: Tensor, index: Tensor, position: list[float]) -> Tensor:
     return total
 
 
-def test_read_voxels_any_position_matches_loop_over_vertices(kernels: str):
+def test_interpolate_voxels_any_position_matches_loop_over_vertices(kernels: str):
     index, unit = sparse_index(), places(20)
     density, colour, views = tables(index, 3)
     basis = basis_of(len(unit), 3)
-    raw, rgb = read_voxels(density, colour, views, *locate(index, unit), basis)
+    raw, rgb = interpolate_voxels(density, colour, views, *locate_vertices(index, unit), basis)
     for n, position in enumerate(unit.tolist()):
-        expected = by_hand(density, index, position)
+        expected = brute_force(density, index, position)
         torch.testing.assert_close(raw[n].double(), expected, atol=1e-5, rtol=1e-5)
-        torch.testing.assert_close(voxel_value(density, index, unit)[n].double(), expected, atol=1e-5, rtol=1e-5)
-        turned = by_hand(views.view(-1, 3, 3), index, position) @ basis[n].double()
-        expected = by_hand(colour, index, position) + turned
+        torch.testing.assert_close(interpolate_scalar(density, index, unit)[n].double(), expected, atol=1e-5, rtol=1e-5)
+        turned = brute_force(views.view(-1, 3, 3), index, position) @ basis[n].double()
+        expected = brute_force(colour, index, position) + turned
         torch.testing.assert_close(rgb[n].double(), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_roughness_matches_loop_over_neighbours(kernels: str):
+def test_total_variation_matches_loop_over_neighbours(kernels: str):
     index = sparse_index()
     (values, *_) = tables(index, 0)
     vertex, rows = vertices_of(index), rows_of(index)
@@ -79,4 +79,4 @@ def test_roughness_matches_loop_over_neighbours(kernels: str):
                 other[axis] += sign
                 if 0 <= other[axis] < SIDE and grid[tuple(place)] > 0 and grid[tuple(other)] > 0:
                     squares += float(values[grid[tuple(place)]] - values[grid[tuple(other)]]) ** 2
-    assert float(roughness(values, vertex, index, 1, rows)) == pytest.approx(squares / (rows - 1), rel=1e-5)
+    assert float(total_variation(values, vertex, index, 1, rows)) == pytest.approx(squares / (rows - 1), rel=1e-5)

@@ -18,13 +18,13 @@ def mlp(bounds: Bounds) -> Field:
 
 
 def hashgrid(bounds: Bounds) -> Field:
-    field = HashGridField(bounds, levels=3, log2_entries=8, coarsest=3, finest=12, width=8)
+    field = HashGridField(bounds, num_levels=3, log2_hashmap_size=8, base_resolution=3, max_resolution=12, width=8)
     torch.nn.init.normal_(field.grid.tables)
     return field
 
 
 def tensorf(bounds: Bounds) -> Field:
-    field = TensoRFField(bounds, 3, 8, coarsest=4, finest=4, stages=1, width=8)
+    field = TensoRFField(bounds, 3, 8, base_resolution=4, max_resolution=4, stages=1, width=8)
     for parameter in (*field.density_volume.parameters(), *field.colour_volume.parameters()):
         torch.nn.init.normal_(parameter)
     return field
@@ -34,19 +34,19 @@ FIELDS = pytest.mark.parametrize("make", [mlp, hashgrid, tensorf])
 Make = Callable[[Bounds], Field]
 
 
-def places(count: int) -> torch.Tensor:
+def random_positions(count: int) -> torch.Tensor:
     return BOX[0] + torch.rand(count, 3) * (BOX[1] - BOX[0])
 
 
-def ways(count: int) -> torch.Tensor:
+def random_directions(count: int) -> torch.Tensor:
     return normalize(torch.randn(count, 3), dim=-1)
 
 
 @FIELDS
 @pytest.mark.parametrize(("unbounded", "count"), [(False, 0), (True, 50)])
 def test_field_any_positions_gives_density_and_colour(make: Make, unbounded: bool, count: int):
-    field, positions = make(Bounds(BOX, unbounded)), places(count) * 3
-    density, rgb, _ = field(positions, ways(count))
+    field, positions = make(Bounds(BOX, unbounded)), random_positions(count) * 3
+    density, rgb, _ = field(positions, random_directions(count))
     assert density.shape == (count,) and rgb.shape == (count, 3)
     assert (density >= 0).all() and density.isfinite().all()
     assert (rgb >= 0).all() and (rgb <= 1).all()
@@ -59,7 +59,7 @@ def test_field_any_positions_gives_density_and_colour(make: Make, unbounded: boo
 def test_field_other_unit_of_length_gives_same_colours(make: Make):
     small, large = make(Bounds(BOX)), make(Bounds(BOX * 10))
     large.load_state_dict(small.state_dict())
-    positions, directions = places(40), ways(40)
+    positions, directions = random_positions(40), random_directions(40)
     (density, rgb, _), (density10, rgb10, _) = small(positions, directions), large(positions * 10, directions)
     torch.testing.assert_close(density10 * 10, density, rtol=1e-3, atol=1e-5)
     torch.testing.assert_close(rgb10, rgb, rtol=1e-3, atol=1e-4)
@@ -68,7 +68,7 @@ def test_field_other_unit_of_length_gives_same_colours(make: Make):
 @FIELDS
 def test_field_every_parameter_gets_gradient(make: Make):
     field = make(Bounds(BOX))
-    density, rgb, _ = field(places(500), ways(500))
+    density, rgb, _ = field(random_positions(500), random_directions(500))
     (density.sum() + rgb.square().sum()).backward()
     for name, parameter in field.named_parameters():
         assert parameter.grad is not None and parameter.grad.abs().max() > 0, name

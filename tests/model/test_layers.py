@@ -23,13 +23,13 @@ def test_truncated_exp_any_input_keeps_gradient():
     assert torch.autograd.gradcheck(truncated_exp, torch.linspace(-10, 10, 9).double().requires_grad_())
 
 
-def test_density_activations_follow_formulas():
+def test_density_activation_each_name_follows_formula():
     x, softplus = torch.tensor([0.0, 3.0, -5.0]), lambda x: (x - 1).exp().log1p()
     for name, formula in (("relu", torch.relu), ("softplus", softplus), ("exp", torch.exp)):
         torch.testing.assert_close(density_activation(name)(x), formula(x))
 
 
-def test_softened_relu_is_softplus_and_saved():
+def test_softenable_relu_softened_is_softplus_and_saved():
     softened, loaded = density_activation("relu"), density_activation("relu")
     softened.soften()
     loaded.load_state_dict(softened.state_dict())
@@ -54,14 +54,14 @@ def test_sinusoidal_any_shape_matches_loop(frequencies, shape):
     torch.testing.assert_close(sinusoidal(x, frequencies), torch.cat([x, *waves], dim=-1), atol=1e-5, rtol=1e-5)
 
 
-def test_level_resolutions_grow_from_coarsest_to_finest():
+def test_level_resolutions_grow_from_base_to_max():
     assert level_resolutions(1, 16, 256) == [16] and level_resolutions(5, 16, 256) == [16, 32, 64, 128, 256]
-    with pytest.raises(InputError, match="model.coarsest"):
+    with pytest.raises(InputError, match="model.base_resolution"):
         level_resolutions(2, 20, 10)
 
 
 def test_hash_grid_small_levels_have_one_entry_a_vertex():
-    grid = HashGrid(cubic_cells(3, 4, 16), log2_entries=9, features=4)
+    grid = HashGrid(cubic_cells(3, 4, 16), log2_hashmap_size=9, features_per_level=4)
     assert grid.cells == [(4,) * 3, (8,) * 3, (16,) * 3] and grid.sizes == [125, 512, 512]
     assert grid.tables.shape == (125 + 512 + 512, 4) and grid.width == 12
     assert 0 < grid.tables.abs().max() <= 1e-4

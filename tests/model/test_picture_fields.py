@@ -11,14 +11,14 @@ from torch import Tensor
 from nerf_lightning.dataset import Picture, PixelDataModule, pixel_grid
 from nerf_lightning.model import FourierField, HashGrid2DField, PictureField, PictureMLP, SirenField
 from nerf_lightning.system import NeRF2D, constant, psnr
-from tests.helpers.assert_close import run_with_threads
+from tests.helpers.kernel_comparison import run_with_threads
 
 SIZES = pytest.mark.parametrize("size", [(40, 25), (1, 1), (1, 30)])
 MAKERS: dict[str, Callable[[tuple[int, int]], PictureField]] = {
     "hash grid": HashGrid2DField,
     "octaves": lambda size: PictureMLP(size, None, width=64),
-    "random sinusoids": lambda size: FourierField(size, features=32, spread=0.2, width=64),
-    "sines": lambda size: SirenField(size, width=64, reach=0.3),
+    "random sinusoids": lambda size: FourierField(size, num_frequencies=32, frequency_std=0.2, width=64),
+    "sines": lambda size: SirenField(size, width=64, first_frequency=0.3),
 }
 FIELDS = pytest.mark.parametrize("make", MAKERS.values(), ids=MAKERS)
 
@@ -51,26 +51,26 @@ def test_picture_field_smooth_picture_is_learned(make):
             optimizer.zero_grad()
             system.training_step(data.draw(step), step).backward()
             optimizer.step()
-        return [system.colours(view.uv)]
+        return [system.query_rgb(view.uv)]
 
-    view = data.held_out(0)
+    view = data.get_held_out_view(0)
     (learned,) = run_with_threads(train, 1)  # steps so small are slower with two, and far slower on a busy machine
     assert psnr(learned, view.rgb) > psnr(view.rgb.mean(0).expand_as(view.rgb), view.rgb) + 13
 
 
 @pytest.mark.parametrize("size", [(16, 12), (33, 7)])
-def test_hash_grid_2d_finest_level_has_vertex_at_pixel_centre(size: tuple[int, int]):
+def test_hash_grid_2d_last_level_has_vertex_at_pixel_centre(size: tuple[int, int]):
     width, height = size
-    field = HashGrid2DField(size, levels=3, log2_entries=8, coarsest=4)
+    field = HashGrid2DField(size, num_levels=3, log2_hashmap_size=8, base_resolution=4)
     assert field.grid.cells[-1] == (width - 1, height - 1)
-    finest = sum(field.grid.sizes[:-1])
+    last_level = sum(field.grid.sizes[:-1])
     before = field(pixel_grid(height, width))
     for column, row in [(0, 0), (width - 1, height - 1), (3, 5), (10, 2)]:
         pixel = column + row * width
-        changed = HashGrid2DField(size, levels=3, log2_entries=8, coarsest=4)
+        changed = HashGrid2DField(size, num_levels=3, log2_hashmap_size=8, base_resolution=4)
         changed.load_state_dict(field.state_dict())
         with torch.no_grad():
-            changed.grid.tables[finest + pixel] += 10
+            changed.grid.tables[last_level + pixel] += 10
         moved = (changed(pixel_grid(height, width)) - before).abs().amax(1)
         assert moved[pixel] > 0.1
         moved[pixel] = 0
@@ -79,7 +79,7 @@ def test_hash_grid_2d_finest_level_has_vertex_at_pixel_centre(size: tuple[int, i
 
 def test_fourier_field_cycles_are_of_longer_side():
     size = (32, 64)
-    field, uv = FourierField(size, features=5, width=8), torch.rand(20, 2)
+    field, uv = FourierField(size, num_frequencies=5, width=8), torch.rand(20, 2)
     lengths = (uv - 0.5) * torch.tensor(size) / 64
     angles = torch.tensor(
         [[2 * math.pi * float(place @ field.cycles[:, k]) for k in range(5)] for place in lengths.unbind()]
@@ -100,7 +100,7 @@ def test_siren_initial_weights_fill_bounds_of_paper():
 
 def test_siren_matches_loop_over_layers():
     size = (40, 20)
-    field, uv = SirenField(size, width=6, depth=3, reach=0.2), torch.rand(10, 2)
+    field, uv = SirenField(size, width=6, depth=3, first_frequency=0.2), torch.rand(10, 2)
     first = 0.2 * math.pi * 20
     h = (2 * uv - 1) * torch.tensor(size) / 40
     for layer, frequency in zip(field.hidden, (first, 30, 30), strict=True):

@@ -7,7 +7,14 @@ from nerf_lightning.model import TensoRFField
 from tests.helpers.growth import grow
 
 BOX = Bounds(torch.tensor([[-2.0, -1, 0], [2, 3, 5]]))
-SMALL = {"density_components": 3, "colour_components": 8, "coarsest": 4, "finest": 16, "stages": 3, "grown": 0.5}
+SMALL = {
+    "density_components": 3,
+    "colour_components": 8,
+    "base_resolution": 4,
+    "max_resolution": 16,
+    "stages": 3,
+    "growth_end": 0.5,
+}
 
 
 def field(**options) -> TensoRFField:
@@ -27,7 +34,7 @@ def directions(count: int = 200) -> torch.Tensor:
 
 
 def test_tensorf_density_is_sum_of_planes_times_lines():
-    tensorf = field(density_components=1, coarsest=1, finest=1, stages=1)
+    tensorf = field(density_components=1, base_resolution=1, max_resolution=1, stages=1)
     planes, lines = tensorf.density_volume.planes.detach(), tensorf.density_volume.lines.detach()
     for i, j, k in ((0, 0, 0), (1, 0, 0), (0, 1, 1), (1, 0, 1)):
         total = planes[0, j, k] * lines[0, i] + planes[1, i, k] * lines[1, j] + planes[2, i, j] * lines[2, k]
@@ -39,8 +46,8 @@ def test_tensorf_grows_with_progress_and_never_back():
     tensorf = field()
     assert tensorf.resolutions == [4, 8, 16] and tensorf.growth is not None
     assert [tensorf.growth.stage_at(p) for p in (0.0, 0.24, 0.25, 0.49, 0.5, 1.0)] == [0, 0, 1, 1, 2, 2]
-    at_once = field(grown=0.0).growth
-    assert at_once is not None and at_once.stage_at(0.0) == 2 and field(finest=4, stages=1).growth is None
+    at_once = field(growth_end=0.0).growth
+    assert at_once is not None and at_once.stage_at(0.0) == 2 and field(max_resolution=4, stages=1).growth is None
     volumes = [*tensorf.density_volume.parameters(), *tensorf.colour_volume.parameters()]
     assert grow(tensorf, 0.2) == []
     for progress, cells in ((0.25, 8), (0.9, 16)):
@@ -52,8 +59,8 @@ def test_tensorf_grows_with_progress_and_never_back():
 
 
 @pytest.mark.parametrize(("progress", "exact"), [(0.25, True), (1.0, True), (1.0, False)])
-def test_tensorf_grow_keeps_values_at_kept_vertices(progress: float, exact: bool):
-    tensorf = field() if exact else field(finest=10)
+def test_tensorf_upsample_keeps_values_at_old_vertices(progress: float, exact: bool):
+    tensorf = field() if exact else field(max_resolution=10)
     x, d = positions(), directions()
     before = [part.detach() for part in tensorf(x, d)[:2]]
     assert grow(tensorf, progress)

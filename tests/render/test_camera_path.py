@@ -8,9 +8,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from nerf_lightning.cameras import Cameras, orbit_around, resample_path
+from nerf_lightning.cameras import Cameras, make_circle_poses, resample_path
 from nerf_lightning.errors import InputError
-from nerf_lightning.render.camera_path import SPLITS, build_path
+from nerf_lightning.render.camera_path import PHOTO_PATHS, build_path
 from nerf_lightning.render.path_file import read_path
 from nerf_lightning.synthetic.bricks import bricks
 
@@ -20,10 +20,10 @@ K = torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]])
 
 
 def circle(frames: int = 12, elevation: float = 0.5) -> Cameras:
-    return Cameras.of_size(K.repeat(frames, 1, 1), orbit_around(CENTRE, UP, 3.0, elevation, frames), 16, 12)
+    return Cameras.pinhole(K.repeat(frames, 1, 1), make_circle_poses(CENTRE, UP, 3.0, elevation, frames), 16, 12)
 
 
-def test_resample_path_more_frames_lie_between_those_of_the_path():
+def test_resample_path_more_frames_interpolate():
     path, fine = circle(12), resample_path(circle(12), 24, closed=True)
     torch.testing.assert_close(fine.c2w[::2], path.c2w, atol=1e-5, rtol=0)
     torch.testing.assert_close(fine.K, K.repeat(24, 1, 1))
@@ -33,7 +33,7 @@ def test_resample_path_more_frames_lie_between_those_of_the_path():
     assert (fine.centres - expected[:, :3, 3]).norm(dim=1).max() < height + 1e-4
 
 
-def test_resample_path_open_keeps_its_ends_and_fewer_are_spread():
+def test_resample_path_open_keeps_ends():
     path = circle(4)
     fine = resample_path(path, 9, closed=False)
     torch.testing.assert_close(fine.c2w[[0, -1]], path.c2w[[0, -1]], atol=1e-6, rtol=0)
@@ -45,9 +45,9 @@ def test_resample_path_open_keeps_its_ends_and_fewer_are_spread():
     ("path", "frames", "count"),
     [("orbit", None, 6), ("orbit", 9, 9), ("spiral", None, 120), ("test", None, 2), ("train", 3, 3)],
 )
-def test_build_path_words(path: str, frames: int | None, count: int):
+def test_build_path_named_paths_have_frames(path: str, frames: int | None, count: int):
     scene = bricks(size=16, train_views=4, val_views=2, orbit_views=6)
-    route = build_path(path, frames, scene.orbit, scene if path in SPLITS else None, torch.eye(4))
+    route = build_path(path, frames, scene.orbit, scene if path in PHOTO_PATHS else None, torch.eye(4))
     assert len(route.cameras) == len(route.views) == count
     if path == "train":
         assert route.views == [0, 2, 3] or len(set(route.views)) == 3
@@ -57,7 +57,7 @@ def test_build_path_words(path: str, frames: int | None, count: int):
         assert (route.photos is None) == (path != "test")
 
 
-def test_read_path_frame_is_that_of_the_run_or_the_file(tmp_path: Path, capsys: pytest.CaptureFixture):
+def test_read_path_converts_frame(tmp_path: Path, capsys: pytest.CaptureFixture):
     """The file's frame is that of the run, turned, three times as large and shifted."""
     path, to_source = circle(5), torch.eye(4)
     to_source[:3, :3] = 3 * torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -113,7 +113,7 @@ PATH = '{"width": 4, "height": 4, "K": [[%s,0,2],[0,1,2],[0,0,1]], "c2w": %s}'
         ('{"path": [{"R": [0,0,0,0], "T": [0,0,0], "fov": 50}]}', "zero norm"),
     ],
 )
-def test_read_path_damaged_file_is_refused(content: str, message: str, tmp_path: Path):
+def test_read_path_damaged_file_raises(content: str, message: str, tmp_path: Path):
     (tmp_path / "path.json").write_text(content)
     with pytest.raises(InputError, match=message):
         read_path(tmp_path / "path.json", circle(), torch.eye(4))

@@ -12,7 +12,7 @@ from nerf_lightning.cli.export import export_compact
 from nerf_lightning.cli.render import render
 from nerf_lightning.config.build import build_data
 from nerf_lightning.errors import InputError
-from nerf_lightning.renderer import over
+from nerf_lightning.renderer import composite_over
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.system import NeRF3D
 
@@ -27,7 +27,7 @@ def test_render_frames_show_what_the_system_renders(run: Path, tmp_path: Path, c
     assert "2 frames of 16 x 16 pixels" in capsys.readouterr().out
     found = load_run(run)
     assert isinstance(found.system, NeRF3D) and found.orbit is not None
-    rays = found.orbit.view_rays(round(len(found.orbit) / 4 - 0.5))
+    rays = found.orbit.generate_view_rays(round(len(found.orbit) / 4 - 0.5))
     expected = found.system.render(rays, background=(0.2, 0.4, 0.6)).rgb
     shown = imageio.imread(output / "00000.png")
     assert np.abs(shown.reshape(-1, 3) / 255 - expected.numpy()).max() <= 0.5 / 255 + 1e-6
@@ -47,7 +47,7 @@ def test_render_test_path_shows_photos_beside_renders(run: Path, tmp_path: Path)
     frame = imageio.imread(frames[0])
     assert frame.shape[1] == 4 * 160 and frame.shape[0] > 160, "truth, render, error, depth, magnified, and a caption"
     data = build_data(load_run(run).cfg)
-    truth = over(data.held_out(0).pixels, torch.zeros(256, 3)).view(16, 16, 3).numpy()
+    truth = composite_over(data.get_held_out_view(0).pixels, torch.zeros(256, 3)).view(16, 16, 3).numpy()
     assert np.abs(frame[5:160:10, 5:160:10] / 255 - truth).max() < 1 / 255
 
 
@@ -75,7 +75,7 @@ def test_render_compact_file_and_the_same_command_reuses_frames(
         ({"path": "dolly"}, "path: found 'dolly'"),
     ],
 )
-def test_render_bad_options_are_refused(given: dict, message: str, small_run: Path):
+def test_render_bad_options_raise(given: dict, message: str, small_run: Path):
     with pytest.raises(InputError, match=message):
         render(small_run, **given)
     assert not list(small_run.glob("render_*"))

@@ -36,7 +36,7 @@ def test_write_video_webp_keeps_transparency(tmp_path: Path):
     assert film.shape == (3, 9, 15, 4) and (np.abs(film[..., 3].astype(int) - 100) < 5).all()
 
 
-def test_write_video_interrupted_continues_and_another_plan_starts_anew(tmp_path: Path):
+def test_write_video_interrupted_resumes_and_other_manifest_restarts(tmp_path: Path):
     output, drawn = tmp_path / "film.gif", []
 
     def failing(index: int) -> np.ndarray:

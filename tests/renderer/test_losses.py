@@ -9,12 +9,12 @@ from nerf_lightning.kernels import volume_weights
 from nerf_lightning.renderer.losses import distortion_loss, near_loss, view_loss
 from nerf_lightning.renderer.renderer import median_depth
 from nerf_lightning.sampler import Samples
-from tests.helpers.ragged_samples import COUNTS, ragged_samples
+from tests.helpers.ragged_samples import SAMPLE_COUNTS, make_ragged_samples
 
 
 def packed(counts: list[int]) -> tuple[torch.Tensor, Samples]:
     """Densities of rays with so many samples each, in double precision."""
-    samples = ragged_samples(counts, torch.float64)
+    samples = make_ragged_samples(counts, torch.float64)
     return torch.rand(len(samples), dtype=torch.float64), samples
 
 
@@ -22,13 +22,13 @@ def weights(density: torch.Tensor, samples: Samples) -> torch.Tensor:
     return volume_weights(density, samples.dt, samples.ray, samples.offsets)
 
 
-def by_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Tensor:
+def distortion_over_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Tensor:
     """The formula as it stands in the paper, ray by ray and pair by pair."""
     total = torch.zeros((), dtype=torch.float64)
     for first, last in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
-        t, dt, thickness = (x[first:last] for x in (samples.t, samples.dt, density * samples.dt))
-        through = torch.exp(-torch.cat([thickness.new_zeros(1), thickness.cumsum(0)]))[: last - first]
-        w, s, width = through * (1 - torch.exp(-thickness)), t / (t + scale), dt * scale / (t + scale) ** 2
+        t, dt, optical_depth = (x[first:last] for x in (samples.t, samples.dt, density * samples.dt))
+        through = torch.exp(-torch.cat([optical_depth.new_zeros(1), optical_depth.cumsum(0)]))[: last - first]
+        w, s, width = through * (1 - torch.exp(-optical_depth)), t / (t + scale), dt * scale / (t + scale) ** 2
         total = total + (w[:, None] * w * (s[:, None] - s).abs()).sum() + (w**2 * width).sum() / 3
     return total / (len(samples.offsets) - 1)
 
@@ -37,7 +37,7 @@ def by_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Ten
 def test_distortion_loss_matches_sum_over_pairs(counts: list[int]):
     density, samples = packed(counts)
     density.requires_grad_()
-    fast, slow = distortion_loss(weights(density, samples), samples, 0.7), by_pairs(density, samples, 0.7)
+    fast, slow = distortion_loss(weights(density, samples), samples, 0.7), distortion_over_pairs(density, samples, 0.7)
     torch.testing.assert_close(fast, slow)
     torch.testing.assert_close(torch.autograd.grad(fast, density), torch.autograd.grad(slow, density))
 
@@ -64,7 +64,7 @@ def test_view_loss_has_no_gradient_of_weights():
     assert view_loss(w, torch.zeros(9, 3), samples) == 0
 
 
-def test_view_loss_plain_places_cost_more():
+def test_view_loss_textureless_pixels_cost_more():
     density, samples = packed([6, 0, 3])
     w, plain = weights(density, samples), torch.tensor([1.0, 0.3, 0.5], dtype=torch.float64)
     view_part = 0.1 + torch.rand(9, 3, dtype=torch.float64)
@@ -79,9 +79,9 @@ def test_view_loss_plain_places_cost_more():
     assert loss == 0 and nothing.grad is not None and not nothing.grad.any()
 
 
-@pytest.mark.parametrize("counts", COUNTS[1:3])
+@pytest.mark.parametrize("counts", SAMPLE_COUNTS[1:3])
 def test_median_depth_halves_opacity(counts: list[int]):
-    samples = ragged_samples(counts, torch.float64)
+    samples = make_ragged_samples(counts, torch.float64)
     density = 4 * torch.rand(len(samples), dtype=torch.float64)
 
     def before(ray: int, distance: float) -> float:
@@ -100,7 +100,7 @@ def test_median_depth_halves_opacity(counts: list[int]):
 
 
 def test_median_depth_ignores_long_last_interval():
-    samples = ragged_samples([3])
+    samples = make_ragged_samples([3])
     samples.dt[2], samples.t[2] = 1000, 500
     density = torch.tensor([0.0, 1e3, 1e-5])
     depth = median_depth(density, torch.tensor([0.99]), samples)

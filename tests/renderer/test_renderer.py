@@ -7,7 +7,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.model import FieldOutput
 from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.sampler import UniformSampler
-from tests.helpers.ragged_samples import ragged_samples
+from tests.helpers.ragged_samples import make_ragged_samples
 
 SCENE = (0.2, 0.4, 0.6)
 
@@ -23,7 +23,7 @@ def fixed(density: Tensor, rgb: Tensor):
 
 def test_render_matches_loop_over_samples(kernels: str):
     counts = [4, 0, 6]
-    samples, rays = ragged_samples(counts), along_z(3)
+    samples, rays = make_ragged_samples(counts), along_z(3)
     density, rgb = 5 * torch.rand(10), torch.rand(10, 3)
     behind = torch.rand(3, 3)
     seen = VolumeRenderer()(rays, samples, fixed(density, rgb), behind)
@@ -60,7 +60,7 @@ def test_render_thin_wall_depth_is_its_distance(distance: float, kernels: str):
     ],
 )
 def test_render_uncovered_part_shows_background(background, colour, sigma, kernels: str):
-    samples = ragged_samples([5])
+    samples = make_ragged_samples([5])
     red = torch.tensor([1.0, 0, 0]).repeat(5, 1)
     seen = VolumeRenderer(background, SCENE)(along_z(1), samples, fixed(torch.full((5,), sigma), red))
     opacity = -torch.expm1(-sigma * samples.dt.sum())
@@ -69,8 +69,8 @@ def test_render_uncovered_part_shows_background(background, colour, sigma, kerne
     assert (float(seen.depth) == 0) == (sigma == 0)
 
 
-def test_render_without_gradient_keeps_nothing_of_each_sample():
-    samples, residual = ragged_samples([5]), torch.rand(5, 3)
+def test_render_without_gradient_returns_no_sample_tensors():
+    samples, residual = make_ragged_samples([5]), torch.rand(5, 3)
     output = VolumeRenderer(view_loss_weight=1.0)(
         along_z(1), samples, lambda *_: FieldOutput(torch.ones(5), torch.rand(5, 3), residual)
     )
@@ -94,7 +94,7 @@ def test_renderer_bad_background_is_refused(background):
 
 
 def test_near_loss_fades_out():
-    samples, rays = ragged_samples([4]), Rays(torch.zeros(1, 3), torch.eye(3)[:1])
+    samples, rays = make_ragged_samples([4]), Rays(torch.zeros(1, 3), torch.eye(3)[:1])
     density = torch.ones(4, requires_grad=True)
 
     def field(positions: Tensor, directions: Tensor):

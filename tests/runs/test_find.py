@@ -7,13 +7,13 @@ import pytest
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.find import find_run, link_latest
-from nerf_lightning.runs.owner import MARKER
+from nerf_lightning.runs.run_lock import RUN_MARKER
 
 
 def make_run(folder: Path, seconds: float) -> Path:
     """A run that was last written at a time."""
     (folder / "checkpoints").mkdir(parents=True)
-    for name in ("config.yaml", "results.json", "checkpoints/last.ckpt", MARKER):
+    for name in ("config.yaml", "results.json", "checkpoints/last.ckpt", RUN_MARKER):
         (folder / name).touch()
         os.utime(folder / name, (seconds, seconds))
     return folder
@@ -31,7 +31,7 @@ def outputs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "outputs"
 
 
-def test_find_run_takes_runs_and_files_as_they_are_and_the_newest_of_a_folder(outputs: Path):
+def test_find_run_returns_newest_run_of_folder(outputs: Path):
     Path("small.npz").touch()
     assert find_run(Path("outputs/lego/2")) == Path("outputs/lego/2")
     assert find_run("small.npz") == Path("small.npz")
@@ -41,14 +41,14 @@ def test_find_run_takes_runs_and_files_as_they_are_and_the_newest_of_a_folder(ou
     assert find_run() == Path("outputs/lego/2")
 
 
-def test_find_run_says_what_it_looked_for(outputs: Path):
+def test_find_run_missing_run_names_search_path(outputs: Path):
     Path("empty").mkdir()
     for name, found in (("nowhere", "nothing there"), ("empty", "a folder without a run")):
         with pytest.raises(InputError, match=f"{name}: found {found}, expected a run"):
             find_run(name)
 
 
-def test_latest_points_to_the_run_that_began_last(outputs: Path, monkeypatch: pytest.MonkeyPatch):
+def test_link_latest_points_to_newest_run(outputs: Path, monkeypatch: pytest.MonkeyPatch):
     for name in ("2", "1"):
         link_latest(Path("outputs/lego") / name)
         assert os.readlink(outputs / "lego" / "latest") == name

@@ -13,7 +13,13 @@ import yaml
 
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
-from nerf_lightning.runs.folder import SWEEP_CALLBACK, TRUST, load_config, load_run, shipped_targets
+from nerf_lightning.runs.folder import (
+    SWEEP_CALLBACK,
+    TRUSTED_PACKAGES_VARIABLE,
+    list_shipped_targets,
+    load_config,
+    load_run,
+)
 
 
 @pytest.fixture
@@ -26,9 +32,9 @@ def write(config: object, folder: Path) -> Path:
     return folder
 
 
-def test_load_config_takes_what_conf_names(config: dict, tmp_path: Path):
-    assert len(shipped_targets()) > 25 and SWEEP_CALLBACK not in shipped_targets()
-    for target in shipped_targets():
+def test_load_config_accepts_shipped_targets(config: dict, tmp_path: Path):
+    assert len(list_shipped_targets()) > 25 and SWEEP_CALLBACK not in list_shipped_targets()
+    for target in list_shipped_targets():
         config["callbacks"]["orbit"] = {"_target_": target}
         assert load_config(write(config, tmp_path)).callbacks.orbit._target_ == target
 
@@ -43,21 +49,21 @@ def test_load_config_takes_what_conf_names(config: dict, tmp_path: Path):
         ["nerf_lightning.callbacks.Orbit"],
     ],
 )
-def test_load_config_refuses_other_targets_anywhere(target: object, config: dict, tmp_path: Path):
+def test_load_config_rejects_untrusted_targets(target: object, config: dict, tmp_path: Path):
     config["callbacks"]["orbit"] = {"nested": [{"_target_": target}]}
     with pytest.raises(InputError, match=r"callbacks\.orbit\.nested\[0\]\._target_.*a class of this package"):
         load_config(write(config, tmp_path))
 
 
-def test_load_config_takes_packages_that_the_user_trusts(config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_load_config_accepts_trusted_packages(config: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     config["model"] = {"_target_": "decimal.Decimal"}
-    with pytest.raises(InputError, match=TRUST):
+    with pytest.raises(InputError, match=TRUSTED_PACKAGES_VARIABLE):
         load_config(write(config, tmp_path))
-    monkeypatch.setenv(TRUST, "decimal")
+    monkeypatch.setenv(TRUSTED_PACKAGES_VARIABLE, "decimal")
     assert load_config(tmp_path).model._target_ == "decimal.Decimal"
 
 
-def test_load_config_interpolates_nothing(config: dict, tmp_path: Path):
+def test_load_config_does_not_interpolate(config: dict, tmp_path: Path):
     """A path may hold such text; a stranger's must not read the environment."""
     config["dataset"]["path"] = "${oc.env:HOME}"
     assert load_config(write(config, tmp_path)).dataset.path == "${oc.env:HOME}"
@@ -138,7 +144,7 @@ DAMAGES: list[tuple[str, Callable[[Path], object], str]] = [
 
 
 @pytest.mark.parametrize(("name", "damage", "word"), DAMAGES)
-def test_load_run_names_the_damaged_file_and_runs_nothing(
+def test_load_run_damaged_file_raises_without_executing(
     name: str, damage: Callable[[Path], object], word: str, small_run: Path, tmp_path: Path
 ):
     folder = Path(shutil.copytree(small_run, tmp_path / "copy"))
@@ -157,12 +163,12 @@ def test_read_checkpoint_to_resume_needs_more_than_weights(small_run: Path, tmp_
         read_checkpoint(tmp_path / "a.ckpt", RESUME_KEYS)
 
 
-def test_resuming_from_a_state_of_another_run_is_one_line(small_run: Path, inside, tmp_path: Path):
+def test_resume_checkpoint_of_other_run_raises(small_run: Path, run_cli, tmp_path: Path):
     folder = Path(shutil.copytree(small_run, tmp_path / "run"))
     state = torch.load(folder / CHECKPOINT, weights_only=True)
     state["optimizer_states"] = [{"state": {}, "param_groups": []}]
     torch.save(state, folder / CHECKPOINT)
     before = {path: path.read_bytes() for path in folder.glob("*.json")}
-    code, _, err = inside(f"resume={folder}", "budget.steps=12")
+    code, _, err = run_cli(f"resume={folder}", "budget.steps=12")
     assert code == 2 and err.count("\n") == 1 and "a state of this run to continue from" in err, err
     assert {path: path.read_bytes() for path in folder.glob("*.json")} == before

@@ -6,7 +6,7 @@ import torch
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays, look_at
-from nerf_lightning.kernels import cell_index, march, use_kernels
+from nerf_lightning.kernels import cell_index, march, set_kernels
 from nerf_lightning.sampler import OccupancySampler, occupancy
 from nerf_lightning.sampler.occupancy import INVISIBLE_DEPTH
 
@@ -17,19 +17,19 @@ def seeded(seed: int = 3) -> Generator:
     return Generator().manual_seed(seed)
 
 
-def toward_the_cube(count: int, seed: int) -> Rays:
+def rays_toward_cube(count: int, seed: int) -> Rays:
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=seeded(seed)), dim=-1)
     aside = torch.rand(count, 3, generator=seeded(seed + 1)) - 0.5
     return Rays(aside - 4 * directions, directions)
 
 
-def test_occupancy_inside_solid_is_queried_after_updates_only():
+def test_occupancy_solid_interior_is_queried_on_full_passes_only():
     """A hard ball: training asks the field in its shell alone, but for the first step after each update.
 
     Where rays do not go front first, which would hide it.
     """
-    use_kernels("reference")
-    sampler = OccupancySampler(CUBE, samples=100, resolution=16, memory=2)
+    set_kernels("reference")
+    sampler = OccupancySampler(CUBE, samples=100, resolution=16, visibility_window=2)
     asked: list[Tensor] = []
 
     def solid(x: Tensor) -> Tensor:
@@ -40,17 +40,17 @@ def test_occupancy_inside_solid_is_queried_after_updates_only():
     for step in range(16 * 6):
         sampler.update(step, solid, seeded(step))
         asked.clear()
-        sampler(toward_the_cube(200, step), solid, seeded(step))
+        sampler(rays_toward_cube(200, step), solid, seeded(step))
         deepest.append(min(float(x.norm(dim=-1).min()) for x in asked))
     assert all(deepest[step] < 0.2 for step in range(32)), "everywhere at first"
     assert all((deepest[step] < 0.2) == (step % 16 == 0) for step in range(64, 96))
     assert min(deepest[step] for step in range(64, 96) if step % 16) > 0.6 - 0.4
-    sampler(toward_the_cube(200, 1000), solid)
+    sampler(rays_toward_cube(200, 1000), solid)
     assert asked[-1].norm(dim=-1).min() < 0.2, "pictures look at all that is occupied"
 
 
-def test_occupancy_cell_reached_again_is_queried_again():
-    sampler = OccupancySampler(CUBE, samples=100, resolution=8, memory=2, decay=0.0)
+def test_occupancy_cell_visible_again_is_active_again():
+    sampler = OccupancySampler(CUBE, samples=100, resolution=8, visibility_window=2, decay=0.0)
     rays = Rays(torch.tensor([[-3.0, 0.1, 0.1]]), torch.tensor([[1.0, 0, 0]]))
     behind = int(cell_index(torch.tensor([[0.9, 0.55, 0.55]]), 8))
     wall = 500.0
@@ -87,7 +87,7 @@ def test_occupancy_updates_find_content():
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.5, False), (2.0, True)])
-def test_occupancy_threshold_is_optical_thickness_of_step(share: float, kept: bool):
+def test_occupancy_threshold_is_optical_depth_of_step(share: float, kept: bool):
     sampler = OccupancySampler(CUBE, samples=100, resolution=4, threshold=0.02)
     thin = share * 0.02 / (2 * math.sqrt(3) / 100)
     sampler.update(0, lambda x: torch.where(x[:, 0] < 0, thin, 1000.0), seeded())
@@ -101,14 +101,14 @@ def test_occupancy_unbounded_scene_is_learned_outside_box():
     assert sampler.grid.occupied[cell_index(unit, 16)].tolist() == [True, False, False]
 
 
-def test_occupancy_cells_few_cameras_see_stay_empty():
+def test_occupancy_mark_invisible_cells_requires_min_cameras():
     """Three cameras look along x from -4; a fourth, alone, looks along y: only what three see may hold anything."""
     eyes = torch.tensor([[-4.0, -0.1, 0], [-4, 0, 0], [-4, 0.1, 0], [0, -4, 0]])
     targets = torch.tensor([[0.0, -0.1, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
     c2w = look_at(eyes, targets, torch.tensor([0.0, 0, 1]))
     K = torch.tensor([[80.0, 0, 8], [0, 80, 8], [0, 0, 1]]).repeat(4, 1, 1)  # a beam of 0.4 at a distance of 4
-    sampler = OccupancySampler(CUBE, samples=100, resolution=16, seen_by=3)
-    sampler.mark_invisible_cells(Cameras.of_size(K, c2w, 16, 16))
+    sampler = OccupancySampler(CUBE, samples=100, resolution=16, min_cameras=3)
+    sampler.mark_invisible_cells(Cameras.pinhole(K, c2w, 16, 16))
     sampler.update(0, lambda x: torch.full((len(x),), 10.0), seeded())
     grid = sampler.grid.occupied.view(16, 16, 16)
     assert grid[:, 8, 8].all() and grid[2, 8, 8] and not grid[8, 0, 8] and not grid[8, 8, 0]
@@ -117,12 +117,12 @@ def test_occupancy_cells_few_cameras_see_stay_empty():
     along_y = Rays(torch.tensor([[0.0, -4, 0]]), torch.tensor([[0.0, 1, 0]]))
     found = sampler(along_y, lambda x: torch.full((len(x),), 0.1)).positions(along_y)
     assert len(found) and found[:, 1].abs().max() < 0.7
-    near = OccupancySampler(replace(CUBE, near=4.0), samples=100, resolution=16, seen_by=3)
-    near.mark_invisible_cells(Cameras.of_size(K, c2w, 16, 16))
+    near = OccupancySampler(replace(CUBE, near=4.0), samples=100, resolution=16, min_cameras=3)
+    near.mark_invisible_cells(Cameras.pinhole(K, c2w, 16, 16))
     assert not near.grid.in_view.view(16, 16, 16)[2, 8, 8], "nearer than rays begin"
 
 
-def test_occupancy_refine_finer_cells_keep_maximum(monkeypatch: pytest.MonkeyPatch):
+def test_occupancy_resize_keeps_maximum(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(occupancy, "RESOLUTION", 8)
     sampler = OccupancySampler(CUBE, samples=100)
     sampler.grid.optical_depth.copy_(torch.rand(8**3, generator=seeded()))
@@ -137,7 +137,7 @@ def test_occupancy_refine_finer_cells_keep_maximum(monkeypatch: pytest.MonkeyPat
             held = [(n * 8 // 12, ((n + 1) * 8 - 1) // 12) for n in (x, y, z)]
             expected = max(float(old[i, j, k]) for i in held[0] for j in held[1] for k in held[2])
             assert float(new[x, y, z]) == expected, name
-    sampler.given_samples = None
+    sampler.requested_samples = None
     sampler.set_resolution_scale(3.0)
     assert sampler.grid.resolution == 24 and sampler.samples == 72
     assert sampler.grid.optical_depth.max() == pytest.approx(before["optical_depth"].max() * 36 / 72)
@@ -156,7 +156,7 @@ def test_occupancy_state_of_any_stage_loads():
     assert whole.samples == 192 and len(whole.grid.optical_depth) == 64**3
 
 
-def test_steps_behind_wall_or_in_empty_space_are_dropped():
+def test_occupancy_steps_behind_wall_or_in_empty_space_are_dropped():
     rays = Rays(torch.tensor([[-3.0, 0.1, 0.2]]), torch.tensor([[1.0, 0, 0]]))
     sampler = OccupancySampler(CUBE, samples=64, resolution=8)
     sampler.grid.optical_depth.fill_(1.0)
@@ -170,7 +170,7 @@ def test_steps_behind_wall_or_in_empty_space_are_dropped():
 
 
 @pytest.mark.parametrize("density", [1e-3, 0.1])
-def test_picture_steps_keep_fog(density: float, box: Bounds, rays: Rays, kernels: str):
+def test_occupancy_evaluation_keeps_fog(density: float, box: Bounds, rays: Rays, kernels: str):
     sampler = OccupancySampler(box, samples=40, resolution=6)
     near, far = box.near_far(rays)
     step = sampler.step_size(sampler.samples)

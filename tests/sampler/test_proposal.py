@@ -6,14 +6,14 @@ from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import volume_weights
-from nerf_lightning.sampler import OccupancySampler, ProposalSampler, Samples, suited_sampler
+from nerf_lightning.sampler import OccupancySampler, ProposalSampler, Samples, choose_sampler
 from nerf_lightning.sampler.proposal import interlevel_loss
 from nerf_lightning.sampler.samples import Histogram
 
-AROUND = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True, near=0.1)
+UNBOUNDED = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True, near=0.1)
 
 
-def nothing(places: torch.Tensor) -> torch.Tensor:
+def zero_density(places: torch.Tensor) -> torch.Tensor:
     return torch.zeros(len(places))
 
 
@@ -32,7 +32,7 @@ def ball(places: torch.Tensor) -> torch.Tensor:
     return 30.0 * ((far < 0.3) | (far > 4)).float()
 
 
-def taught(sampler: ProposalSampler, steps: int) -> ProposalSampler:
+def train_sampler(sampler: ProposalSampler, steps: int) -> ProposalSampler:
     """After some steps beside a field that does not change."""
     optimizer = torch.optim.Adam(sampler.parameters(), lr=0.05)
     for step in range(steps):
@@ -49,23 +49,23 @@ def taught(sampler: ProposalSampler, steps: int) -> ProposalSampler:
     return sampler
 
 
-def share_on_surfaces(samples: Samples, some: Rays) -> float:
+def fraction_on_surfaces(samples: Samples, some: Rays) -> float:
     """Share of the samples within 0.1 of where the ball or the shell begins."""
     far = samples.positions(some).norm(dim=1)
     return float((((far - 0.3).abs() < 0.1) | ((far - 4).abs() < 0.4)).float().mean())
 
 
 def test_proposal_sampler_after_training_finds_surfaces():
-    small = ProposalSampler(AROUND, anneal=20)
+    small = ProposalSampler(UNBOUNDED, anneal=20)
     some = rays(200, 99)
-    before = share_on_surfaces(small(some, ball), some)
-    after = share_on_surfaces(taught(small, 60)(some, ball), some)
+    before = fraction_on_surfaces(small(some, ball), some)
+    after = fraction_on_surfaces(train_sampler(small, 60)(some, ball), some)
     assert before < 0.25 and after > 0.5
 
 
 def test_proposal_sampler_samples_tile_ray():
-    sampler, some = ProposalSampler(AROUND, samples=10), rays(30)
-    samples = sampler(some, nothing, Generator().manual_seed(1))
+    sampler, some = ProposalSampler(UNBOUNDED, samples=10), rays(30)
+    samples = sampler(some, zero_density, Generator().manual_seed(1))
     t, dt = samples.t.view(30, 10), samples.dt.view(30, 10)
     assert samples.offsets.tolist() == list(range(0, 301, 10))
     assert torch.equal(samples.ray, torch.arange(30).repeat_interleave(10))
@@ -91,13 +91,13 @@ def test_interlevel_loss_only_unexpected_weight_costs():
 
 
 def test_proposal_sampler_state_export_renders_alike():
-    sampler, other, some = taught(ProposalSampler(AROUND), 20), ProposalSampler(AROUND), rays(20)
+    sampler, other, some = train_sampler(ProposalSampler(UNBOUNDED), 20), ProposalSampler(UNBOUNDED), rays(20)
     other.import_state(sampler.export_state())
     assert torch.equal(sampler(some, ball).t, other(some, ball).t)
     with pytest.raises(RuntimeError, match="size mismatch"):
-        ProposalSampler(AROUND, finest=48).import_state(sampler.export_state())
+        ProposalSampler(UNBOUNDED, max_resolution=48).import_state(sampler.export_state())
 
 
-def test_suited_sampler_unbounded_scene_takes_proposals():
-    assert isinstance(suited_sampler(AROUND), ProposalSampler)
-    assert isinstance(suited_sampler(replace(AROUND, unbounded=False, near=None)), OccupancySampler)
+def test_choose_sampler_unbounded_scene_takes_proposals():
+    assert isinstance(choose_sampler(UNBOUNDED), ProposalSampler)
+    assert isinstance(choose_sampler(replace(UNBOUNDED, unbounded=False, near=None)), OccupancySampler)

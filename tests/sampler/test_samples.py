@@ -1,10 +1,10 @@
 import pytest
 import torch
 
-from nerf_lightning.sampler import pack, split
+from nerf_lightning.sampler import pack, split_by_rays
 
 
-def test_pack_keeps_chosen_intervals_ray_by_ray():
+def test_pack_mask_keeps_intervals_in_ray_order():
     edges = torch.rand(13, 8).cumsum(1)
     keep = torch.rand(13, 7) < 0.5
     t, dt, ray, offsets = [], [], [], [0]
@@ -23,17 +23,17 @@ def test_pack_keeps_chosen_intervals_ray_by_ray():
     torch.testing.assert_close(samples.dt, torch.tensor(dt), rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("most", [1, 7, 1000])
-def test_split_any_size_holds_whole_rays(most: int):
+@pytest.mark.parametrize("max_samples", [1, 7, 1000])
+def test_split_by_rays_any_size_yields_complete_rays(max_samples: int):
     keep = torch.rand(40, 6) < 0.5
     keep[7:10] = False
     keep[13] = True
     edges = torch.rand(40, 7).sort(dim=1).values
     samples = pack(edges, keep)
     rays, t, ray = [], [], []
-    for run, part in split(samples, most):
+    for run, part in split_by_rays(samples, max_samples):
         counts = part.offsets.diff()
-        assert len(part) <= most or len(counts) == 1
+        assert len(part) <= max_samples or len(counts) == 1
         assert torch.equal(part.ray, torch.arange(len(counts)).repeat_interleave(counts))
         rays += range(run.start, run.stop)
         t.append(part.t)

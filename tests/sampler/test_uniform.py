@@ -8,11 +8,11 @@ import torch
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import inverse_cdf
+from nerf_lightning.kernels import invert_cdf
 from nerf_lightning.sampler import ImportanceSampler, UniformSampler
 
 
-def nowhere(positions: Tensor) -> Tensor:
+def no_density(positions: Tensor) -> Tensor:
     raise AssertionError("a uniform sampler does not ask the field")
 
 
@@ -22,7 +22,7 @@ def seeded(seed: int = 3) -> Generator:
 
 @pytest.mark.parametrize("count", [1, 17])
 def test_uniform_sampler_takes_equal_steps(count: int, box: Bounds, rays: Rays):
-    samples = UniformSampler(box, count)(rays, nowhere)
+    samples = UniformSampler(box, count)(rays, no_density)
     near, far = box.near_far(rays)
     assert 0 < int((near < far).sum()) < len(rays), "some hit, some miss"
     for r in range(len(rays)):
@@ -44,7 +44,7 @@ def test_uniform_sampler_jitter_stays_in_stratum(unbounded: bool, box: Bounds, r
     near, far = bounds.near_far(rays)
     rays, near, far = (x[near < far] for x in (rays, near, far))
     even = torch.linspace(0, 1, count + 1).expand(len(rays), -1)
-    strata = bounds.distances(rays, near, far, (even[:, 1:] + even[:, :-1]) / 2)
+    strata = bounds.s_to_t(rays, near, far, (even[:, 1:] + even[:, :-1]) / 2)
     jittered = torch.stack([sampler.edges(rays, seeded(i)) for i in range(50)])
     torch.testing.assert_close(jittered[0][:, [0, -1]], sampler.edges(rays, None)[:, [0, -1]])
     inner = jittered[:, :, 1:-1]
@@ -54,11 +54,11 @@ def test_uniform_sampler_jitter_stays_in_stratum(unbounded: bool, box: Bounds, r
     assert unbounded or abs(float(share.mean()) - 0.5) < 0.05
 
 
-def test_inverse_cdf_inverts_cumulated_weights():
+def test_invert_cdf_inverts_cumulated_weights():
     edges, u = torch.rand(20, 11).cumsum(1), torch.rand(20, 40)
     weights = torch.rand(20, 10) * (torch.rand(20, 10) < 0.3)
     weights[0] = 0  # falls back to uniform in the interval's number
-    found = inverse_cdf(edges, weights, u)
+    found = invert_cdf(edges, weights, u)
     for r in range(20):
         cdf = torch.cat([torch.zeros(1), (weights[r].double() + 1e-5).cumsum(0)])
         # What counts is the probability mass between the two answers: distances jump where there is no weight.

@@ -2,22 +2,29 @@
 
 import pytest
 
-from nerf_lightning.sizing.choose import Measured, Target, choose_final, choose_first, choose_second, stop_growing
+from nerf_lightning.sizing.choose import (
+    RungResult,
+    Target,
+    choose_candidate,
+    choose_final,
+    choose_neighbour,
+    is_growth_finished,
+)
 
 NEAR = Target(within_db=0.3)
 
 
-def rungs(*psnrs: float) -> list[Measured]:
+def rungs(*psnrs: float) -> list[RungResult]:
     """Rungs of twice the bytes each."""
-    return [Measured(psnr, 1000 * 2**index) for index, psnr in enumerate(psnrs)]
+    return [RungResult(psnr, 1000 * 2**index) for index, psnr in enumerate(psnrs)]
 
 
 @pytest.mark.parametrize(
     ("gain", "times", "stops"), [(0.2, 2, False), (0.05, 2, True), (0.2, 8, True), (0.2, 0.5, False)]
 )
-def test_stop_growing_weighs_gain_against_bytes(gain: float, times: float, stops: bool):
-    after = Measured(20 + gain, int(1000 * times))
-    assert stop_growing([Measured(20, 1000), after, after], NEAR) is stops
+def test_is_growth_finished_weighs_gain_against_bytes(gain: float, times: float, stops: bool):
+    after = RungResult(20 + gain, int(1000 * times))
+    assert is_growth_finished([RungResult(20, 1000), after, after], NEAR) is stops
 
 
 @pytest.mark.parametrize(
@@ -31,8 +38,8 @@ def test_stop_growing_weighs_gain_against_bytes(gain: float, times: float, stops
         ((20, 27), Target(psnr=28), True),  # a full training gains 1 dB at least
     ],
 )
-def test_stop_growing_ends_where_it_does_not_pay(psnrs: tuple, target: Target, stops: bool):
-    assert stop_growing(rungs(*psnrs), target) is stops
+def test_is_growth_finished_after_rungs_without_gain(psnrs: tuple, target: Target, stops: bool):
+    assert is_growth_finished(rungs(*psnrs), target) is stops
 
 
 @pytest.mark.parametrize(
@@ -44,8 +51,8 @@ def test_stop_growing_ends_where_it_does_not_pay(psnrs: tuple, target: Target, s
         ((20, 25, 24), Target(psnr=30), 1),  # the best where none is enough
     ],
 )
-def test_choose_first_is_smallest_that_seems_enough(psnrs: tuple, target: Target, first: int):
-    assert choose_first(rungs(*psnrs), target) == first
+def test_choose_candidate_returns_smallest_sufficient(psnrs: tuple, target: Target, first: int):
+    assert choose_candidate(rungs(*psnrs), target) == first
 
 
 @pytest.mark.parametrize(
@@ -60,10 +67,10 @@ def test_choose_first_is_smallest_that_seems_enough(psnrs: tuple, target: Target
         ((21.2, 23.4, 25.4, 27.4, 28.9, 29.7, 30.2), Target(psnr=31), 6, 33.5, 4),
     ],
 )
-def test_choose_second_is_neighbour_that_may_change_the_choice(
+def test_choose_neighbour_returns_rung_that_may_change_choice(
     psnrs: tuple, target: Target, first: int, full: float, second: int | None
 ):
-    assert choose_second(first, full, rungs(*psnrs), target, last=3) == second
+    assert choose_neighbour(first, full, rungs(*psnrs), target, last=3) == second
 
 
 @pytest.mark.parametrize(
@@ -75,5 +82,5 @@ def test_choose_second_is_neighbour_that_may_change_the_choice(
         ({2: 27.0, 3: 27.5}, Target(psnr=28), (3, False)),
     ],
 )
-def test_choose_final_is_smallest_that_is_enough(full: dict[int, float], target: Target, expected: tuple[int, bool]):
-    assert choose_final({rung: Measured(psnr, 1) for rung, psnr in full.items()}, target) == expected
+def test_choose_final_returns_smallest_sufficient(full: dict[int, float], target: Target, expected: tuple[int, bool]):
+    assert choose_final({rung: RungResult(psnr, 1) for rung, psnr in full.items()}, target) == expected

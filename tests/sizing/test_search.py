@@ -11,30 +11,37 @@ import yaml
 from nerf_lightning.cameras import Bounds
 from nerf_lightning.cli.rightsize import describe_scene, rightsize
 from nerf_lightning.config import conf_dir
-from nerf_lightning.config.build import PictureFrame, SceneFrame, build_data, build_system
-from nerf_lightning.config.compose import composed
+from nerf_lightning.config.build import ImageMetadata, SceneMetadata, build_data, build_system
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import VoxelField
 from nerf_lightning.runs.compact import load_compact
 from nerf_lightning.sizing import search
 from nerf_lightning.sizing.choose import Target, read_ladder
-from nerf_lightning.synthetic.objects import PILE, make_scene
+from nerf_lightning.synthetic.objects import PILE, make_object_scene
 from tests.helpers.growth import grow
 
 RUNGS = [
-    {"density_components": 3, "colour_components": 3, "coarsest": 4, "finest": 4, "width": 8, "stages": 1},
-    {"density_components": 8, "colour_components": 8, "coarsest": 8, "finest": 16, "width": 16},
-    {"density_components": 8, "colour_components": 8, "coarsest": 8, "finest": 24, "width": 16},
+    {
+        "density_components": 3,
+        "colour_components": 3,
+        "base_resolution": 4,
+        "max_resolution": 4,
+        "width": 8,
+        "stages": 1,
+    },
+    {"density_components": 8, "colour_components": 8, "base_resolution": 8, "max_resolution": 16, "width": 16},
+    {"density_components": 8, "colour_components": 8, "base_resolution": 8, "max_resolution": 24, "width": 16},
 ]
 SAMPLERS = [{"samples": 32, "resolution": 8}, {"samples": 64, "resolution": 16}]
 FAST = ["threads=1", "device=cpu", "callbacks.snapshots.steps=[]", "budget.steps=60"]
-SCENE = SceneFrame(Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])), (0.0, 0.0, 0.0))
+SCENE = SceneMetadata(Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])), (0.0, 0.0, 0.0))
 
 
 @pytest.fixture
 def scene(tmp_path: Path) -> str:
-    save_npz(make_scene(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
+    save_npz(make_object_scene(PILE, size=16, views=8, held_out=2), tmp_path / "scene.npz")
     (tmp_path / "ladder.yaml").write_text(yaml.safe_dump({"rungs": RUNGS, "samplers": SAMPLERS}))
     return str(tmp_path / "scene.npz")
 
@@ -45,9 +52,7 @@ def search_small(scene: str, overrides: list[str] = [], **options: Any) -> dict[
     return rightsize(scene, *given, **{"ladder": str(folder / "ladder.yaml"), "output": folder / "found", **options})
 
 
-def test_rightsize_leaves_smallest_that_is_enough_and_an_experiment(
-    scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_rightsize_writes_smallest_run_and_experiment(scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     found = search_small(scene, psnr=14.0)
     folder, rung = tmp_path / "found", found["rung"]
     assert found["reached"] and found["full"][str(rung)]["psnr"] >= 14
@@ -59,7 +64,7 @@ def test_rightsize_leaves_smallest_that_is_enough_and_an_experiment(
     own = yaml.safe_load((folder / "best.yaml").read_text())
     assert {key: own["model"][key] for key in RUNGS[rung]} == RUNGS[rung]
     assert own["sampler"]["samples"] == found["sampler"]["samples"] and own["dataset"]["path"] == scene
-    monkeypatch.setattr(search, "climb", lambda *_: pytest.fail("climbed again"))
+    monkeypatch.setattr(search, "climb_ladder", lambda *_: pytest.fail("climbed again"))
     assert search_small(scene, psnr=14.0) == found, "a finished search is only told again"
     with pytest.raises(InputError, match="something else in it"):
         search_small(scene, psnr=15.0)
@@ -69,7 +74,7 @@ def test_rightsize_interrupted_keeps_what_was_trained_in_full(
     scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     with monkeypatch.context() as patched:
-        patched.setattr(search, "smallest", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        patched.setattr(search, "compress_system", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
             search_small(scene, ["budget.steps=8"], psnr=90.0)
     monkeypatch.setattr(search, "train", lambda *_: pytest.fail("trained again"))
@@ -77,7 +82,7 @@ def test_rightsize_interrupted_keeps_what_was_trained_in_full(
     assert not found["reached"] and (tmp_path / "found" / "rightsize.json").exists()
 
 
-def test_rightsize_takes_images_and_any_distance(tmp_path: Path):
+def test_rightsize_accepts_images(tmp_path: Path):
     imageio.imwrite(tmp_path / "a b.png", torch.arange(32 * 32 * 3).view(32, 32, 3).remainder(251).byte().numpy())
     given = ["model=picture_mlp", "callbacks.pictures=null", *FAST]
     found = rightsize(str(tmp_path / "a b.png"), *given, within_db=100.0, output=tmp_path / "found")
@@ -94,7 +99,7 @@ def test_rightsize_takes_images_and_any_distance(tmp_path: Path):
         (["sampler.samples=-1"], {}, "sampler.samples"),
     ],
 )
-def test_rightsize_bad_options_leave_nothing(
+def test_rightsize_bad_options_write_nothing(
     overrides: list[str], options: dict, message: str, scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
@@ -103,7 +108,7 @@ def test_rightsize_bad_options_leave_nothing(
     assert {file.name for file in tmp_path.iterdir()} == {"scene.npz", "ladder.yaml"}
 
 
-def test_describe_scene_tells_experiments_scenes_and_images_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_describe_scene_distinguishes_experiments_scenes_and_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lego").mkdir()
     (tmp_path / "cat (1).JPG").touch()
@@ -118,18 +123,21 @@ def test_describe_scene_tells_experiments_scenes_and_images_apart(tmp_path: Path
 @pytest.mark.parametrize(
     ("recipe", "rungs"),
     [
-        ("hashgrid_small", [{"width": 16, "levels": 3}, {"width": 8, "levels": 3}, {"width": 8, "levels": 2}]),
+        (
+            "hashgrid_small",
+            [{"width": 16, "num_levels": 3}, {"width": 8, "num_levels": 3}, {"width": 8, "num_levels": 2}],
+        ),
         (
             "tensorf_small",
             [{**RUNGS[1], "width": None}, {**RUNGS[1], "width": 8}, {**RUNGS[1], "colour_components": 3}],
         ),
     ],
 )
-def test_climb_rung_smaller_in_something_starts_anew(recipe: str, rungs: list[dict], scene: str, tmp_path: Path):
+def test_climb_ladder_smaller_option_restarts(recipe: str, rungs: list[dict], scene: str, tmp_path: Path):
     small = ["sampler.samples=32", "sampler.resolution=16", "dataset.samples=1000"]
     given = ["dataset=photos", f"dataset.path={scene}", f"recipe={recipe}", *FAST[:-1], "budget.steps=4", *small]
-    cfg = composed(given, tmp_path)
-    found, _ = search.climb(cfg, build_data(cfg), rungs, Target(psnr=99.0), tmp_path)
+    cfg = compose_config(given, tmp_path)
+    found, _ = search.climb_ladder(cfg, build_data(cfg), rungs, Target(psnr=99.0), tmp_path)
     assert len(found) == 3 and min(one.psnr for one in found) > 3
 
 
@@ -137,18 +145,18 @@ def test_climb_rung_smaller_in_something_starts_anew(recipe: str, rungs: list[di
     ("given", "steps"), [([], search.RUNG_STEPS), (["budget.seconds=10"], search.RUNG_STEPS), (["budget.steps=40"], 3)]
 )
 def test_configure_rung_counts_steps_whatever_the_budget(given: list[str], steps: int, tmp_path: Path):
-    part = search.configure_rung(composed([*given, "budget.patience=1"], tmp_path), [{"width": 8}] * 10, 0)
+    part = search.configure_rung(compose_config([*given, "budget.patience=1"], tmp_path), [{"width": 8}] * 10, 0)
     assert (part.budget.steps, part.budget.seconds, part.budget.patience) == (steps, None, None)
-    assert set(part.callbacks) == {"guard"} and part.logger is None and part.model.width == 8
+    assert set(part.callbacks) == {"recovery"} and part.logger is None and part.model.width == 8
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (conf_dir() / "ladders").glob("*.yaml")))
 def test_shipped_ladder_rungs_can_be_built_and_grow(name: str, tmp_path: Path):
     ladder, sizes = read_ladder(name), []
     flat = not ladder.samplers
-    cfg = composed(["+experiment=picture", f"model={name}"] if flat else [f"recipe={name}_medium"], tmp_path)
+    cfg = compose_config(["+experiment=picture", f"model={name}"] if flat else [f"recipe={name}_medium"], tmp_path)
     for options in ladder.rungs:
-        system = build_system(search.set_options(cfg, "model", options), PictureFrame(640, 480) if flat else SCENE)
+        system = build_system(search.set_options(cfg, "model", options), ImageMetadata(640, 480) if flat else SCENE)
         if isinstance(system.field, VoxelField):  # the whole box takes long
             system.field.prune(torch.zeros(4, 4, 4, dtype=torch.bool).index_fill(0, torch.tensor([1]), True))
         if not flat:
@@ -159,7 +167,7 @@ def test_shipped_ladder_rungs_can_be_built_and_grow(name: str, tmp_path: Path):
         build_system(search.set_options(cfg, "sampler", options), SCENE)
 
 
-def test_read_ladder_refuses_what_is_none(tmp_path: Path):
+def test_read_ladder_invalid_file_raises(tmp_path: Path):
     path = tmp_path / "mine.yaml"
     path.write_text("rungs: [{width: 8}, {width: 16}]")
     assert read_ladder(str(path)).rungs == [{"width": 8}, {"width": 16}]

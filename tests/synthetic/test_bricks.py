@@ -8,12 +8,12 @@ import torch
 
 from benchmarks.synthetic.tabletop import find_nearest, shade_points
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.kernels.cpu.solids import LIGHT, is_lit
+from nerf_lightning.kernels.cpu.solids import LIGHT_POSITION, is_lit
 from nerf_lightning.synthetic.bricks import bricks
-from nerf_lightning.synthetic.solids import Solids, bulldozer
-from nerf_lightning.synthetic.tracer import map_shadow, rasterize
+from nerf_lightning.synthetic.solids import Solids, load_bulldozer
+from nerf_lightning.synthetic.tracer import rasterize, render_shadow_map
 
-TURNED = [[1, 0, 0], [0, math.sqrt(0.5), -math.sqrt(0.5)], [0, math.sqrt(0.5), math.sqrt(0.5)]]
+TILTED_AXES = [[1, 0, 0], [0, math.sqrt(0.5), -math.sqrt(0.5)], [0, math.sqrt(0.5), math.sqrt(0.5)]]
 
 
 @pytest.fixture(scope="module")
@@ -30,11 +30,11 @@ def make_solid(cylinder: bool, half: tuple[float, float, float], axes: object = 
 def trace_exactly(rays):
     """The bulldozer in double precision: origins, directions, the solid each ray hits and the distance to it."""
     origins, directions = rays.origins.double().numpy(), rays.directions.double().numpy()
-    return origins, directions, *find_nearest(bulldozer(), origins, directions)
+    return origins, directions, *find_nearest(load_bulldozer(), origins, directions)
 
 
 BOX, CYLINDER = make_solid(False, (1, 2, 3)), make_solid(True, (0.5, 0.5, 1))
-BAR = make_solid(False, (0.2, 0.1, math.sqrt(2)), TURNED)
+BAR = make_solid(False, (0.2, 0.1, math.sqrt(2)), TILTED_AXES)
 
 
 @pytest.mark.parametrize(
@@ -55,11 +55,11 @@ def test_find_nearest_gives_distance(solids, origin, direction, distance):
 
 def test_solids_aabb_turned_cylinder_is_exact():
     reach = math.sqrt(0.5) * (1 + 0.5)
-    aabb = make_solid(True, (0.5, 0.5, 1), TURNED).aabb
+    aabb = make_solid(True, (0.5, 0.5, 1), TILTED_AXES).aabb
     np.testing.assert_allclose(aabb, [[-0.5, -reach, -reach], [0.5, reach, reach]])
 
 
-def test_bricks_images_are_the_same_everywhere(scene):
+def test_bricks_images_have_fixed_hash(scene):
     assert scene.sha256().startswith("7869af40dd6c")
 
 
@@ -74,7 +74,7 @@ def test_bricks_traced_images_are_cached_and_damaged_ones_traced_again(tmp_path,
 
 
 def test_bricks_cameras_match_the_paper(scene):
-    aabb = torch.from_numpy(bulldozer().aabb).float()
+    aabb = torch.from_numpy(load_bulldozer().aabb).float()
     torch.testing.assert_close(scene.bounds.half_size, 1.02 * Bounds(aabb).half_size)
     for cameras in (scene.train.cameras, scene.val.cameras, scene.orbit):
         torch.testing.assert_close(cameras.centres.norm(dim=-1), torch.full((len(cameras),), 4.0311))
@@ -88,7 +88,7 @@ def test_bricks_cameras_match_the_paper(scene):
         assert (cameras.K[:, :2, 2] == 20).all()
 
 
-def test_bricks_held_out_views_are_apart():
+def test_bricks_held_out_views_differ_from_training_views():
     scene = bricks(size=1)
     train, val = (views.cameras.centres / 4.0311 for views in (scene.train, scene.val))
     assert (len(train), len(val), len(scene.orbit)) == (100, 10, 60)
@@ -99,10 +99,10 @@ def test_bricks_held_out_views_are_apart():
         assert heights.min() < 0.15 and heights.max() > 0.85
 
 
-def test_images_agree_with_rays_traced_one_by_one(scene):
+def test_render_view_agrees_with_rays_traced_one_by_one(scene):
     cameras = scene.train.cameras
-    solid, depth = rasterize(bulldozer(), cameras, 2)
-    rays = cameras.view_rays(2)
+    solid, depth = rasterize(load_bulldozer(), cameras, 2)
+    rays = cameras.generate_view_rays(2)
     _, _, expected, distance = trace_exactly(rays)
     along = distance * (rays.directions @ cameras.c2w[2, :3, 2]).double().numpy()
     same = solid.reshape(-1) == expected
@@ -110,7 +110,7 @@ def test_images_agree_with_rays_traced_one_by_one(scene):
     hit = same & (expected >= 0)
     np.testing.assert_allclose(depth.reshape(-1)[hit], along[hit], atol=1e-4)
     # The image is the mean of nine rays a pixel, over those that hit.
-    origins, directions, solid, t = trace_exactly(cameras.resized((120, 120)).view_rays(2))
+    origins, directions, solid, t = trace_exactly(cameras.resize((120, 120)).generate_view_rays(2))
     seen = np.flatnonzero(solid >= 0)
     rgba = np.zeros((len(t), 4))
     points = origins[seen] + t[seen, None] * directions[seen]
@@ -120,13 +120,13 @@ def test_images_agree_with_rays_traced_one_by_one(scene):
     assert (np.abs(scene.train.images[2].numpy() / 255 - expected).max(-1) < 0.01).mean() > 0.98
 
 
-def test_shadow_agrees_with_rays_to_the_light(scene):
-    origins, directions, solid, t = trace_exactly(scene.train.cameras.view_rays(3))
+def test_render_shadow_map_agrees_with_rays_to_the_light(scene):
+    origins, directions, solid, t = trace_exactly(scene.train.cameras.generate_view_rays(3))
     hit = np.flatnonzero(solid >= 0)[::3]
     points = origins[hit] + t[hit, None] * directions[hit]
-    light = np.array(LIGHT, float)
-    first, way = find_nearest(bulldozer(), np.broadcast_to(light, points.shape), points - light)
+    light = np.array(LIGHT_POSITION, float)
+    first, way = find_nearest(load_bulldozer(), np.broadcast_to(light, points.shape), points - light)
     expected = (first == solid[hit]) | (way > 1 - 1e-3)
     assert 0.2 < expected.mean() < 0.95
-    found = [is_lit.py_func(map_shadow(), k, point) for k, point in zip(solid[hit], points, strict=True)]
+    found = [is_lit.py_func(render_shadow_map(), k, point) for k, point in zip(solid[hit], points, strict=True)]
     assert (np.array(found) == expected).mean() > 0.96

@@ -18,17 +18,17 @@ def test_schedule_warmup_rises_linearly(schedule):
     assert min(slopes) > 0 and max(slopes) == pytest.approx(min(slopes)), "in a straight line"
 
 
-@pytest.mark.parametrize(("schedule", "final"), [(exponential, 0.1), (cosine, 0.2)])
-def test_schedule_falls_to_final_factor(schedule, final):
-    values = [schedule(p, 0, 0.0, final) for p in STEPS]
-    assert values[0] == 1 and values[-1] == pytest.approx(final)
+@pytest.mark.parametrize(("schedule", "final_factor"), [(exponential, 0.1), (cosine, 0.2)])
+def test_schedule_end_reaches_final_factor(schedule, final_factor):
+    values = [schedule(p, 0, 0.0, final_factor) for p in STEPS]
+    assert values[0] == 1 and values[-1] == pytest.approx(final_factor)
     assert all(a > b for a, b in pairwise(values))
-    halfway = math.sqrt(final) if schedule is exponential else (1 + final) / 2
+    halfway = math.sqrt(final_factor) if schedule is exponential else (1 + final_factor) / 2
     assert values[100] == pytest.approx(halfway)
 
 
 @SCHEDULES
-def test_schedule_inverse_root_lowers_rate_of_many_steps(schedule):
-    assert schedule(0.5, 0, inverse_root=100) == schedule(0.5, 9999) == schedule(0.5)
-    assert schedule(0.5, 300, inverse_root=100) == pytest.approx(schedule(0.5) / 2)
-    assert schedule(0.5, 9900, inverse_root=100) == pytest.approx(schedule(0.5) / 10)
+def test_schedule_inverse_sqrt_after_lowers_factor(schedule):
+    assert schedule(0.5, 0, inverse_sqrt_after=100) == schedule(0.5, 9999) == schedule(0.5)
+    assert schedule(0.5, 300, inverse_sqrt_after=100) == pytest.approx(schedule(0.5) / 2)
+    assert schedule(0.5, 9900, inverse_sqrt_after=100) == pytest.approx(schedule(0.5) / 10)

@@ -10,18 +10,18 @@ from typing import Any
 import pytest
 import torch
 
-from nerf_lightning.callbacks import Evaluation, HeldOut, Progress
+from nerf_lightning.callbacks import Evaluation, PeriodicValidation, ProgressBar
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.cli.app import fail
-from nerf_lightning.config.compose import composed
+from nerf_lightning.cli.app import exit_with_error
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.model import TensoRFField
-from nerf_lightning.runs.owner import LOCK, MARKER
+from nerf_lightning.runs.run_lock import LOCK_FILE, RUN_MARKER
 from nerf_lightning.system import System
 from nerf_lightning.training.train import train
 from tests.helpers.growth import grow
 
 SMALL = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=12", "model.width=8"]
-SMALL += ["callbacks.heldout.at=[0.5]", "callbacks.pictures=null"]
+SMALL += ["callbacks.validation.fractions=[0.5]", "callbacks.pictures=null"]
 STOP = 6
 State = tuple[int, dict[str, torch.Tensor]]
 
@@ -44,14 +44,14 @@ def assert_same(one: State, other: State) -> None:
 
 
 def temporary_files() -> list[Path]:
-    return [path for path in Path().rglob(".*") if path.name not in (LOCK, MARKER)]
+    return [path for path in Path().rglob(".*") if path.name not in (LOCK_FILE, RUN_MARKER)]
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory, own_cache: None) -> Path:
+def undisturbed(tmp_path_factory: pytest.TempPathFactory, isolated_cache: None) -> Path:
     """The folder of a run that nothing befell."""
     folder = tmp_path_factory.mktemp("whole") / "run"
-    train(composed(SMALL, folder), folder=folder)
+    train(compose_config(SMALL, folder), folder=folder)
     return folder
 
 
@@ -72,35 +72,35 @@ def at_step(
 
 
 MOMENTS = {
-    "in a step": (Progress, "on_train_batch_end", STOP),
-    "before a measurement": (HeldOut, "measure", STOP),
+    "in a step": (ProgressBar, "on_train_batch_end", STOP),
+    "before a measurement": (PeriodicValidation, "measure", STOP),
     "while a view is rendered": (System, "evaluate_held_out", STOP),
     "in the test": (Evaluation, "on_test_batch_end", 12),
 }
 
 
 @pytest.mark.parametrize(("moment", "signum"), [*((m, signal.SIGTERM) for m in MOMENTS), ("in a step", signal.SIGINT)])
-def test_interrupted_run_is_saved_and_resumed_to_the_same_weights(
-    moment: str, signum: int, undisturbed: Path, inside, monkeypatch: pytest.MonkeyPatch
+def test_resume_interrupted_run_gives_same_weights(
+    moment: str, signum: int, undisturbed: Path, run_cli, monkeypatch: pytest.MonkeyPatch
 ):
     kind, hook, step = MOMENTS[moment]
     with monkeypatch.context() as patch:
         at_step(patch, kind, hook, lambda: signal.raise_signal(signum), step)
-        code, _, err = inside(*SMALL, "name=broken")
+        code, _, err = run_cli(*SMALL, "name=broken")
     assert code == 128 + signum, err
     line = err.splitlines()[-1]
     assert signal.Signals(signum).name in line and " resume=outputs/broken/" in line, err
     assert read_status(run_of("broken")) == "interrupted" and read_state(run_of("broken"))[0] == step
     assert not temporary_files()
-    code, _, err = inside(line.split()[-1])
+    code, _, err = run_cli(line.split()[-1])
     assert code == 0, err
     assert read_status(run_of("broken")) == read_status(undisturbed)
     assert_same(read_state(run_of("broken")), read_state(undisturbed))
 
 
-def test_signal_before_training_leaves_nothing(inside, monkeypatch: pytest.MonkeyPatch):
+def test_train_signal_before_training_writes_nothing(run_cli, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("nerf_lightning.training.resume.build_data", lambda cfg: signal.raise_signal(signal.SIGINT))
-    code, _, err = inside(*SMALL)
+    code, _, err = run_cli(*SMALL)
     assert code == 130 and "the same command continues" in err and err.count("\n") == 1
     assert not list(Path().iterdir())
 
@@ -113,34 +113,34 @@ def limit() -> Iterator[Callable[[int], None]]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_out_of_memory_is_one_line_and_an_untrained_run_leaves_nothing(inside, tmp_path: Path, monkeypatch):
-    def fail() -> None:
+def test_train_out_of_memory_raises_and_writes_nothing(run_cli, tmp_path: Path, monkeypatch):
+    def exit_with_error() -> None:
         raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total capacity of")
 
     with monkeypatch.context() as patch:
-        at_step(patch, Progress, "on_train_batch_start", fail, step=0)
-        code, _, err = inside(*SMALL)
+        at_step(patch, ProgressBar, "on_train_batch_start", exit_with_error, step=0)
+        code, _, err = run_cli(*SMALL)
     assert code == 2 and "20.00 GiB" in err and err.count("\n") == 1
     assert not [path for path in tmp_path.rglob("*") if not path.is_dir() and not path.is_symlink()]
     with monkeypatch.context() as patch:
-        at_step(patch, Progress, "on_train_batch_start", fail)
-        assert inside(*SMALL)[0] == 2
+        at_step(patch, ProgressBar, "on_train_batch_start", exit_with_error)
+        assert run_cli(*SMALL)[0] == 2
     assert read_status(run_of("smoke_2d")) == "failed"
 
 
 @pytest.mark.parametrize("room", [0, 5000])
-def test_full_disk_keeps_the_last_checkpoint(room: int, undisturbed: Path, inside, limit, monkeypatch):
+def test_train_full_disk_keeps_last_checkpoint(room: int, undisturbed: Path, run_cli, limit, monkeypatch):
     """Nothing fits at all, or checkpoints alone do not."""
     with monkeypatch.context() as patch:
-        at_step(patch, Progress, "on_train_batch_end", lambda: limit(room))
+        at_step(patch, ProgressBar, "on_train_batch_end", lambda: limit(room))
         # Who reads what the process has said needs files too.
-        patch.setattr("nerf_lightning.cli.app.fail", lift_limit(limit))
-        code, _, err = inside(*SMALL, "logger=null", "callbacks.checkpoints.every_seconds=1e-9", "name=broken")
+        patch.setattr("nerf_lightning.cli.app.exit_with_error", lift_limit(limit))
+        code, _, err = run_cli(*SMALL, "logger=null", "callbacks.checkpoints.every_seconds=1e-9", "name=broken")
     assert code == 2 and err.count("\n") == 1 and "no space left on the device" in err, err
     assert read_state(run_of("broken"))[0] == STOP - 1 and not temporary_files()
     results = run_of("broken") / "results.json"
     assert not results.exists() or read_status(run_of("broken")) == "failed"
-    code, _, err = inside(f"resume={run_of('broken')}")
+    code, _, err = run_cli(f"resume={run_of('broken')}")
     assert code == 0, err
     assert_same(read_state(run_of("broken")), read_state(undisturbed))
 
@@ -148,14 +148,14 @@ def test_full_disk_keeps_the_last_checkpoint(room: int, undisturbed: Path, insid
 def lift_limit(limit: Callable[[int], None]) -> Callable[[Exception], None]:
     def lift_and_fail(error: Exception) -> None:
         limit(resource.RLIM_INFINITY)
-        fail(error)
+        exit_with_error(error)
 
     return lift_and_fail
 
 
-def test_growing_field_counts_its_last_size():
+def test_train_growing_field_checks_memory_of_final_size():
     box = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
-    field = TensoRFField(box, coarsest=4, finest=12, stages=3, size="fixed")
-    expected, first = field.values_grown(), sum(p.numel() for p in field.parameters())
+    field = TensoRFField(box, base_resolution=4, max_resolution=12, stages=3, size="fixed")
+    expected, first = field.max_num_parameters(), sum(p.numel() for p in field.parameters())
     grow(field, 1.0)
     assert expected == sum(p.numel() for p in field.parameters()) > 3 * first

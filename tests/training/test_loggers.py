@@ -14,13 +14,13 @@ from nerf_lightning.training import loggers
 SMALL = ("+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=3", "callbacks=null", "hydra.run.dir=run")
 
 
-def test_tensorboard_run_is_one_file_with_curves(inside, tmp_path: Path):
+def test_tensorboard_run_is_one_file_with_curves(run_cli, tmp_path: Path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
     from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
     small = [word for word in SMALL if word != "callbacks=null"]
     quick = ("callbacks.throughput.every=1", "callbacks.pictures=null", "seed=3")
-    code, _, err = inside(*small, *quick)
+    code, _, err = run_cli(*small, *quick)
     assert code == 0, err
     results = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
     (file,) = (tmp_path / "run").glob("events.out.tfevents.*")
@@ -39,8 +39,8 @@ def test_tensorboard_run_is_one_file_with_curves(inside, tmp_path: Path):
     assert values["method"].string_value == "picture_mlp" and values["bytes"].number_value == results["artifact_bytes"]
 
 
-def test_csv(inside, tmp_path: Path):
-    code, out, err = inside(*SMALL, "logger=csv", "seed=3")
+def test_csv_logger_writes_metrics(run_cli, tmp_path: Path):
+    code, out, err = run_cli(*SMALL, "logger=csv", "seed=3")
     assert code == 0 and "tensorboard" not in out, err
     results = json.loads((tmp_path / "run" / "results.json").read_text(encoding="utf-8"))
     folder = tmp_path / "run" / "csv" / "version_0"
@@ -51,24 +51,22 @@ def test_csv(inside, tmp_path: Path):
 
 
 @pytest.mark.parametrize("extra", ["wandb", "mlflow"])
-def test_a_service_whose_package_is_missing_is_told_in_a_line(
-    extra: str, inside, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_logger_missing_package_raises(extra: str, run_cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, extra, None)
-    code, _, err = inside(*SMALL, f"logger={extra}")
+    code, _, err = run_cli(*SMALL, f"logger={extra}")
     assert code == 2 and err.count("\n") == 1 and f"pip install 'nerf_lightning[{extra}]', or logger=csv" in err
     assert not list(tmp_path.iterdir())
 
 
-def test_each_training_has_a_run_of_its_own_at_weights_and_biases(monkeypatch: pytest.MonkeyPatch):
+def test_finish_wandb_ends_run_of_each_training(monkeypatch: pytest.MonkeyPatch):
     finished: list[str] = []
     module = ModuleType("wandb")
     module.run = own = SimpleNamespace(finish=lambda: finished.append("the user's"))
     monkeypatch.setitem(sys.modules, "wandb", module)
-    with loggers.finishing_wandb():
+    with loggers.finish_wandb():
         pass
     assert module.run is own and finished == []
-    with pytest.raises(RuntimeError), loggers.finishing_wandb():
+    with pytest.raises(RuntimeError), loggers.finish_wandb():
         module.run = SimpleNamespace(finish=lambda: finished.append("training's"))
         raise RuntimeError
     assert finished == ["training's"]

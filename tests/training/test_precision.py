@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from nerf_lightning.config.build import PRECISIONS
-from nerf_lightning.config.compose import composed
+from nerf_lightning.config.build import SUPPORTED_PRECISIONS
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.training.train import train
 
 SCENE = ("dataset.size=16", "dataset.train_views=3", "dataset.val_views=1", "dataset.rays=32", "sampler.samples=16")
@@ -18,8 +18,10 @@ PICTURE = ("+experiment=picture", "dataset.max_side=16")
     ("model", "precision"),
     [("hashgrid", "16-mixed"), *((m, "bf16-mixed") for m in ("hashgrid", "tensorf", "mlp", "voxels", "hashgrid2d"))],
 )
-def test_mixed_precision_trains(model: str, precision: str, tmp_path: Path):
+def test_train_mixed_precision_learns(model: str, precision: str, tmp_path: Path):
     base = PICTURE if model == "hashgrid2d" else SCENE
     small = ["dataset.seed=0", "budget.steps=2", "callbacks=null", "logger=null", f"model={model}"]
-    assert precision in PRECISIONS
-    assert math.isfinite(train(composed([*base, *small, f"trainer.precision={precision}"], tmp_path), folder=tmp_path))
+    assert precision in SUPPORTED_PRECISIONS
+    assert math.isfinite(
+        train(compose_config([*base, *small, f"trainer.precision={precision}"], tmp_path), folder=tmp_path)
+    )

@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.helpers.train_models import ANOTHER, MODELS, fingerprints
+from tests.helpers.train_models import MODELS, OTHER_SEED, train_fingerprints
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_every_shipped_model_is_among_them():
+def test_repeatability_covers_every_shipped_model():
     assert set(MODELS) == {file.stem for file in (ROOT / "conf" / "model").glob("*.yaml")}
 
 
@@ -27,15 +27,15 @@ def threads() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def test_same_seed_same_weights_in_another_process_and_across_an_interruption(threads: None, tmp_path: Path):
+def test_train_same_seed_gives_same_weights_across_processes(threads: None, tmp_path: Path):
     line = [sys.executable, str(ROOT / "tests" / "helpers" / "train_models.py"), str(tmp_path / "broken"), "6"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen(line, env={**os.environ, "PYTHONPATH": str(ROOT)}, **pipes) as process:
-        first = fingerprints(tmp_path / "whole", 0)
+        first = train_fingerprints(tmp_path / "whole", 0)
         out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
     second = json.loads(out.splitlines()[-1])
-    assert set(first) == set(second) == {*MODELS, ANOTHER}
+    assert set(first) == set(second) == {*MODELS, OTHER_SEED}
     for name in first:
         assert first[name] == second[name], name
-    assert first[ANOTHER] != first["siren"], "another seed must give other weights"
+    assert first[OTHER_SEED] != first["siren"], "another seed must give other weights"

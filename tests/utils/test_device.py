@@ -9,21 +9,21 @@ import torch
 import yaml
 from omegaconf import OmegaConf
 
-from nerf_lightning.config.build import build_system, build_trainer, device_of
-from nerf_lightning.config.compose import composed
-from nerf_lightning.config.limits import Limits, limits_of
+from nerf_lightning.config.build import build_system, build_trainer, resolve_run_device
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.config.limits import Limits, get_limits
 from nerf_lightning.dataset import PixelDataModule, RayDataModule
-from nerf_lightning.dataset.picture import builtin_picture
-from nerf_lightning.dataset.pixels import Picture
+from nerf_lightning.dataset.picture import make_builtin_picture
+from nerf_lightning.dataset.pixel_datamodule import Picture
 from nerf_lightning.errors import InputError
-from nerf_lightning.runs.owner import LOCK, MARKER
-from nerf_lightning.synthetic.objects import MARBLE, make_scene
+from nerf_lightning.runs.run_lock import LOCK_FILE, RUN_MARKER
+from nerf_lightning.synthetic.objects import MARBLE, make_object_scene
 from nerf_lightning.system import NeRF2D
-from nerf_lightning.utils.device import CPU, devices, the_device
+from nerf_lightning.utils.device import CPU, available_devices, resolve_device
 
 
 @pytest.fixture
-def plain_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+def cpu_only_torch(monkeypatch: pytest.MonkeyPatch) -> None:
     """A machine with a CPU alone, and a PyTorch that knows nothing else."""
     for kind in (torch.cuda, torch.backends.mps):
         monkeypatch.setattr(kind, "is_available", lambda: False)
@@ -31,7 +31,7 @@ def plain_torch(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(kind, "is_built", lambda: False)
 
 
-def test_resumed_run_may_use_another_device(inside, small_run: Path, plain_torch: None, tmp_path: Path):
+def test_train_resumed_on_another_device_continues(run_cli, small_run: Path, cpu_only_torch: None, tmp_path: Path):
     run = tmp_path / "run"
     shutil.copytree(small_run, run)
     config = yaml.safe_load((run / "config.yaml").read_text())
@@ -39,69 +39,71 @@ def test_resumed_run_may_use_another_device(inside, small_run: Path, plain_torch
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     before = {path: path.stat().st_mtime_ns for path in run.rglob("*")}
     for key in ("device", "trainer.accelerator"):
-        code, _, err = inside(f"resume={run}", f"{key}=cuda")
+        code, _, err = run_cli(f"resume={run}", f"{key}=cuda")
         assert code == 2 and err.count("\n") == 1 and "device: found 'cuda'," in err, err
-    after = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name not in (LOCK, MARKER)}
+    after = {path: path.stat().st_mtime_ns for path in run.rglob("*") if path.name not in (LOCK_FILE, RUN_MARKER)}
     assert before == after, "nothing was touched"
-    code, _, err = inside(f"resume={run}", "device=cpu", "limits.chunk=100", "budget.steps=12")
+    code, _, err = run_cli(f"resume={run}", "device=cpu", "limits.chunk_samples=100", "budget.steps=12")
     assert code == 0, err
     saved = yaml.safe_load((run / "config.yaml").read_text())
     assert saved["device"] == saved["trainer"]["accelerator"] == "cpu"
-    assert saved["limits"] == {"batch": None, "chunk": 100}
+    assert saved["limits"] == {"batch_scale": None, "chunk_samples": 100}
     assert json.loads((run / "results.json").read_text())["steps"] == 12
 
 
-def test_auto_is_the_best_device(monkeypatch: pytest.MonkeyPatch, plain_torch: None):
-    assert devices()[:1] == ["cpu"] and the_device("auto") == the_device("cpu") == CPU
+def test_resolve_device_auto_is_best_available(monkeypatch: pytest.MonkeyPatch, cpu_only_torch: None):
+    assert available_devices()[:1] == ["cpu"] and resolve_device("auto") == resolve_device("cpu") == CPU
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
-    assert the_device("auto") == the_device("mps") == torch.device("mps")
+    assert resolve_device("auto") == resolve_device("mps") == torch.device("mps")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    assert the_device("auto") == torch.device("cuda") and the_device("cpu") == CPU
+    assert resolve_device("auto") == torch.device("cuda") and resolve_device("cpu") == CPU
     with pytest.raises(InputError, match="found 'gpu', expected auto, or what is there: cuda, mps, cpu"):
-        the_device("gpu")
+        resolve_device("gpu")
 
 
-def test_trainer_uses_the_device(tmp_path: Path, plain_torch: None):
+def test_build_trainer_device_option_sets_accelerator(tmp_path: Path, cpu_only_torch: None):
     for given in ([], ["device=cuda", "trainer.accelerator=cpu"]):
-        cfg = composed([*given, "callbacks=picture", "~logger"], tmp_path)
-        assert device_of(cfg) == CPU
+        cfg = compose_config([*given, "callbacks=picture", "~logger"], tmp_path)
+        assert resolve_run_device(cfg) == CPU
         assert build_trainer(cfg, tmp_path, CPU).strategy.root_device == CPU
-    assert composed(["device=mps"], tmp_path).trainer.accelerator == "mps"
+    assert compose_config(["device=mps"], tmp_path).trainer.accelerator == "mps"
 
 
 @pytest.mark.parametrize(("device", "batch", "chunk"), [("cuda", 4, 524288), ("xpu", 1, 32768)])
-def test_limits_follow_device_and_run(device: str, batch: int, chunk: int):
+def test_limits_of_device_defaults_are_overridden_by_run(device: str, batch: int, chunk: int):
     where = torch.device(device)
 
     def limits(**given: object) -> Limits:
-        return limits_of(OmegaConf.create({"limits": given}), where)
+        return get_limits(OmegaConf.create({"limits": given}), where)
 
-    assert limits() == limits(batch=None, chunk=None) == Limits(batch, chunk)
-    assert (limits(batch=3), limits(chunk=7)) == (Limits(3, chunk), Limits(batch, 7))
-    for broken in ({"batch": 0}, {"chunk": "many"}, {"rays": 3}):
+    assert limits() == limits(batch_scale=None, chunk_samples=None) == Limits(batch, chunk)
+    assert (limits(batch_scale=3), limits(chunk_samples=7)) == (Limits(3, chunk), Limits(batch, 7))
+    for broken in ({"batch_scale": 0}, {"chunk_samples": "many"}, {"rays": 3}):
         with pytest.raises(InputError, match=f"limits.{next(iter(broken))}"):
             limits(**broken)
 
 
-def test_chunk_follows_the_device(tmp_path: Path):
-    from nerf_lightning.config.build import PictureFrame, frame_of
+def test_build_system_chunk_follows_device_limits(tmp_path: Path):
+    from nerf_lightning.config.build import ImageMetadata, get_metadata
 
-    cfg, data = composed([], tmp_path), RayDataModule(make_scene(MARBLE, size=4, views=3, held_out=1))
-    assert build_system(cfg, frame_of(data)).chunk == 32768
-    system = build_system(cfg, frame_of(data), torch.device("cuda"))
+    cfg, data = compose_config([], tmp_path), RayDataModule(make_object_scene(MARBLE, size=4, views=3, held_out=1))
+    assert build_system(cfg, get_metadata(data)).chunk == 32768
+    system = build_system(cfg, get_metadata(data), torch.device("cuda"))
     assert system.chunk == system.sampler.chunk == 524288
-    assert build_system(composed(["sampler=uniform"], tmp_path), frame_of(data)).chunk_rays == 4096
-    flat = build_system(composed(["+experiment=smoke_2d", "limits.chunk=5"], tmp_path), PictureFrame(8, 8))
+    assert build_system(compose_config(["sampler=uniform"], tmp_path), get_metadata(data)).chunk_rays == 4096
+    flat = build_system(
+        compose_config(["+experiment=smoke_2d", "limits.chunk_samples=5"], tmp_path), ImageMetadata(8, 8)
+    )
     assert isinstance(flat, NeRF2D) and flat.chunk == 5
 
 
 def test_enlarge_scales_rays_and_samples_of_a_step():
-    picture = PixelDataModule(Picture("sunset", "test", builtin_picture(8)), pixels=10)
-    picture.enlarge(4)
+    picture = PixelDataModule(Picture("sunset", "test", make_builtin_picture(8)), pixels=10)
+    picture.scale_batch(4)
     assert len(picture.draw(0).uv) == 40
-    scene = make_scene(MARBLE, size=4, views=3, held_out=1)
+    scene = make_object_scene(MARBLE, size=4, views=3, held_out=1)
     large = RayDataModule(scene, 100, 1000)
-    large.enlarge(8)
-    assert (large.rays, large.first_rays, large.samples, len(large.draw(0).pixels)) == (800, 800, 8000, 800)
-    large.note_samples(4000)
+    large.scale_batch(8)
+    assert (large.rays, large.initial_rays, large.samples, len(large.draw(0).pixels)) == (800, 800, 8000, 800)
+    large.adapt_num_rays(4000)
     assert large.rays == 1040

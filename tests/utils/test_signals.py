@@ -10,7 +10,7 @@ import pytest
 
 from nerf_lightning.utils.signals import (
     SIGNALS,
-    Interrupted,
+    SignalInterrupt,
     defer_signals,
     exit_on_signal,
     handle_signals,
@@ -26,47 +26,47 @@ def signum(request: pytest.FixtureRequest) -> Iterator[int]:
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_signal_raises_where_the_process_is(signum: int):
+def test_handle_signals_signal_raises_at_once(signum: int):
     with handle_signals(), handle_signals():
-        with pytest.raises(Interrupted) as raised:
+        with pytest.raises(SignalInterrupt) as raised:
             signal.raise_signal(signum)
         assert raised.value.signum == received_signal() == signum
-        with pytest.raises(Interrupted):  # also where a clean-up has lost it
+        with pytest.raises(SignalInterrupt):  # also where a clean-up has lost it
             raise_if_signalled()
 
 
-def test_signal_in_a_callback_is_raised_after_it(signum: int):
+def test_handle_signals_signal_in_callback_raises_after_it(signum: int):
     callback = ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signum))  # no exception leaves it
-    with handle_signals(), pytest.raises(Interrupted):
+    with handle_signals(), pytest.raises(SignalInterrupt):
         callback()
         time.sleep(10)
 
 
-def test_deferred_signal_is_raised_after_the_outer_block(signum: int, capfd: pytest.CaptureFixture[str]):
+def test_defer_signals_nested_raises_after_outer_block(signum: int, capfd: pytest.CaptureFixture[str]):
     done = []
-    with handle_signals(), pytest.raises(Interrupted), defer_signals():
+    with handle_signals(), pytest.raises(SignalInterrupt), defer_signals():
         with defer_signals():
             signal.raise_signal(signum)
         done.append("outer block")
     assert done and capfd.readouterr().err.count("\n") == 1, "says at once that it has heard"
 
 
-def test_part_of_a_deferring_block_may_be_interrupted(signum: int):
+def test_defer_signals_false_lets_part_be_interrupted(signum: int):
     done = []
-    with handle_signals(), pytest.raises(Interrupted), defer_signals(), defer_signals(False):
+    with handle_signals(), pytest.raises(SignalInterrupt), defer_signals(), defer_signals(False):
         signal.raise_signal(signum)
         done.append("not reached")
-    with handle_signals(), pytest.raises(Interrupted), defer_signals():
+    with handle_signals(), pytest.raises(SignalInterrupt), defer_signals():
         signal.raise_signal(signum)
         with defer_signals(False):
             done.append("not begun")
     assert not done
 
 
-def test_second_signal_exits_at_once(signum: int, monkeypatch: pytest.MonkeyPatch):
+def test_handle_signals_second_signal_exits_at_once(signum: int, monkeypatch: pytest.MonkeyPatch):
     codes: list[int] = []
     monkeypatch.setattr(os, "_exit", codes.append)
-    with handle_signals(), pytest.raises(Interrupted), defer_signals():
+    with handle_signals(), pytest.raises(SignalInterrupt), defer_signals():
         signal.raise_signal(signum)
         assert not codes
         signal.raise_signal(signum)
@@ -74,11 +74,11 @@ def test_second_signal_exits_at_once(signum: int, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError])
-def test_command_line_exits_with_a_line(error: type[Exception] | None, signum: int, capsys: pytest.CaptureFixture[str]):
+def test_exit_on_signal_prints_one_line(error: type[Exception] | None, signum: int, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as end, exit_on_signal():
         try:
             signal.raise_signal(signum)
-        except Interrupted as interrupted:
+        except SignalInterrupt as interrupted:
             if error is not None:
                 raise error from interrupted  # of a library
             interrupted.hint = "resume it"

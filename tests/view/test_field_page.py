@@ -12,14 +12,14 @@ import torch
 import viser
 from viser.transforms import SO3
 
-from nerf_lightning.cameras import Cameras, look_at, orbit_around
-from nerf_lightning.config.compose import composed
+from nerf_lightning.cameras import Cameras, look_at, make_circle_poses
+from nerf_lightning.config.compose import compose_config
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.folder import load_run
 from nerf_lightning.training.train import train
-from nerf_lightning.view.field_page import FieldPage, Visitor
-from nerf_lightning.view.painter import Painter, Wish
-from tests.helpers.ball_runs import CENTRE, RADIUS, ball_system
+from nerf_lightning.view.field_page import ClientState, FieldPage
+from nerf_lightning.view.progressive import ProgressiveRenderer, ViewRequest
+from tests.helpers.ball_runs import CENTRE, RADIUS, make_ball_system
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 BLUE = (0.0, 0.0, 1.0)
@@ -27,39 +27,39 @@ BLUE = (0.0, 0.0, 1.0)
 
 def orbit() -> Cameras:
     K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
-    return Cameras.of_size(K.repeat(4, 1, 1), orbit_around(CENTRE, UP, 3.0, 0.3, 4), 32, 24)
+    return Cameras.pinhole(K.repeat(4, 1, 1), make_circle_poses(CENTRE, UP, 3.0, 0.3, 4), 32, 24)
 
 
-def wish(**changes: Any) -> Wish:
+def wish(**changes: Any) -> ViewRequest:
     c2w = look_at(CENTRE + torch.tensor([3.0, 0, 0]), CENTRE, UP).double().numpy()
     given = {"c2w": c2w, "fov": 0.8, "aspect": 1.5, "channel": "rgb", "background": BLUE, "near": 0.0, "far": math.inf}
-    return Wish(**{**given, "most": 60, **changes})
+    return ViewRequest(**{**given, "most": 60, **changes})
 
 
 @pytest.fixture(scope="module")
-def painter() -> Painter:
-    return Painter(ball_system(), orbit())
+def painter() -> ProgressiveRenderer:
+    return ProgressiveRenderer(make_ball_system(), orbit())
 
 
-def test_painter_shows_what_the_system_renders(painter: Painter):
-    picture = painter.paint(wish(), 60, lambda: True)
+def test_progressive_renderer_matches_system(painter: ProgressiveRenderer):
+    picture = painter.render(wish(), 60, lambda: True)
     assert picture is not None and picture.shape == (40, 60, 3)
     cameras = wish().cameras(60)
     assert (cameras.width, cameras.height) == (60, 40)
-    expected = painter.system.render(cameras.view_rays(0), background=BLUE).rgb.view(40, 60, 3).numpy()
+    expected = painter.system.render(cameras.generate_view_rays(0), background=BLUE).rgb.view(40, 60, 3).numpy()
     assert np.abs(picture / 255 - expected).max() <= 0.5 / 255 + 1e-6
     assert picture[0, 0].tolist() == [0, 0, 255]
     # A ball of radius r at distance d covers a circle of the radius f r / sqrt(d^2 - r^2).
     focal = 20 / math.tan(0.4)
-    opacity = painter.paint(wish(channel="opacity", background=(0.0, 0.0, 0.0)), 60, lambda: True)
+    opacity = painter.render(wish(channel="opacity", background=(0.0, 0.0, 0.0)), 60, lambda: True)
     assert opacity is not None
     covered = math.sqrt(float((opacity[..., 0] / 255.0).sum()) / math.pi)
     assert covered == pytest.approx(focal * RADIUS / math.sqrt(9 - RADIUS**2), rel=0.08)
 
 
-def test_painter_near_and_far_cut_away(painter: Painter):
+def test_progressive_renderer_near_and_far_clip(painter: ProgressiveRenderer):
     whole, behind, before = (
-        painter.paint(wish(channel="depth", background=(0.0, 0.0, 0.0), **cut), 60, lambda: True)
+        painter.render(wish(channel="depth", background=(0.0, 0.0, 0.0), **cut), 60, lambda: True)
         for cut in ({}, {"near": 3.0}, {"far": 3.0 - RADIUS - 0.2})
     )
     assert whole is not None and behind is not None and before is not None
@@ -88,31 +88,31 @@ class Browser(viser.ClientHandle):
 
 @pytest.fixture
 def page() -> Iterator[FieldPage]:
-    page = FieldPage("ball", ball_system(), orbit(), None, "127.0.0.1", 0, 96, live=True)
+    page = FieldPage("ball", make_ball_system(), orbit(), None, "127.0.0.1", 0, 96, live=True)
     yield page
     page.stop()
 
 
 def test_field_page_sends_coarse_then_finer_images_then_rests(page: FieldPage):
     browser = Browser()
-    assert not page.paint()
+    assert not page.render_next()
     page._welcome(browser)
-    page.painter.rate = 24 * 24 / 0.08
-    while page.paint():
-        page.painter.rate = 24 * 24 / 0.08
+    page.painter.rays_per_second = 24 * 24 / 0.08
+    while page.render_next():
+        page.painter.rays_per_second = 24 * 24 / 0.08
     sides = [picture.shape[1] for picture in browser.pictures]
     assert sides[0] < 40 and sides[-1] == 96 and sides == sorted(set(sides))
     page.background.value = "white"
     page._want()
-    assert page.paint()
+    assert page.render_next()
     assert browser.pictures[-1][0, 0].tolist() == [255, 255, 255]
     page._farewell(browser)
-    assert not page.paint()
+    assert not page.render_next()
 
 
 def test_field_page_click_shows_the_samples_of_its_ray(page: FieldPage):
     page.click((3.0, -0.2, 0.05), (-2.0, 0.0, 0.0))
-    page.paint()
+    page.render_next()
     points = page.server.scene.get_handle_by_name("/ray/samples").points
     np.testing.assert_allclose(points[:, 1:], np.tile([-0.2, 0.05], (len(points), 1)), atol=1e-5)
     assert (np.diff(points[:, 0]) < 0).all() and abs(points[:, 0]).max() <= 1.0
@@ -122,9 +122,7 @@ def test_field_page_click_shows_the_samples_of_its_ray(page: FieldPage):
 SMALL = ["+experiment=smoke_3d", "dataset.size=16", "budget.steps=12", "callbacks.orbit=null", "threads=1", "~logger"]
 
 
-def test_live_shows_progress_stays_open_while_seen_and_leaves_the_training_as_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_live_shows_progress_and_does_not_change_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     browser, told = Browser(), []
     show = FieldPage.show_progress
 
@@ -138,20 +136,25 @@ def test_live_shows_progress_stays_open_while_seen_and_leaves_the_training_as_it
 
     def welcome(self: FieldPage, *given: Any, **more: Any) -> None:
         welcomed(self, *given, **more)
-        self.visitors[browser.client_id] = Visitor(browser)
+        self.clients[browser.client_id] = ClientState(browser)
 
     monkeypatch.setattr(FieldPage, "__init__", welcome)
     monkeypatch.setattr(FieldPage, "show_progress", with_browser)
-    train(composed([*SMALL, "callbacks=live", "callbacks.live.port=0", "callbacks.live.share=0.9"], tmp_path / "live"))
+    train(
+        compose_config(
+            [*SMALL, "callbacks=live", "callbacks.live.port=0", "callbacks.live.max_time_fraction=0.9"],
+            tmp_path / "live",
+        )
+    )
     assert browser.pictures
     assert 0 < told[0][0] < 1 and told[0][1].startswith("step ")
     assert told[-1][0] == 1 and "training is done: held out" in told[-1][1]
-    train(composed(SMALL, tmp_path / "alone"))
+    train(compose_config(SMALL, tmp_path / "alone"))
     live, alone = (load_run(tmp_path / name).system.state_dict() for name in ("live", "alone"))
     assert all(torch.equal(live[key], alone[key]) for key in alone)
 
 
-def test_live_refuses_an_image(tmp_path: Path):
+def test_live_image_run_raises(tmp_path: Path):
     flat = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", "callbacks.orbit=null", "~logger"]
     with pytest.raises(InputError, match="callbacks: found live"):
-        train(composed([*flat, "callbacks=live"], tmp_path / "b"))
+        train(compose_config([*flat, "callbacks=live"], tmp_path / "b"))

@@ -17,7 +17,7 @@ import torch
 from nerf_lightning.cli.view import has_run, view
 from nerf_lightning.dataset import Scene, Views, save_npz
 from nerf_lightning.errors import InputError
-from nerf_lightning.view.drawing import colour_points
+from nerf_lightning.view.geometry import colour_points
 from nerf_lightning.view.scene_page import ScenePage
 from nerf_lightning.view.serve import announce, resolve_host
 
@@ -31,7 +31,7 @@ def page(scene: Scene) -> Iterator[ScenePage]:
     page.stop()
 
 
-def test_scene_page_is_served_with_cameras_where_they_are_and_no_rays(page: ScenePage, scene: Scene):
+def test_scene_page_shows_cameras_and_no_rays(page: ScenePage, scene: Scene):
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=10)
     connection.request("GET", "/")
     response = connection.getresponse()
@@ -74,10 +74,10 @@ def test_scene_page_controls_change_what_is_shown(page: ScenePage):
     assert nodes("/training/0").image is None
 
 
-def test_colour_points_takes_the_nearest_photos_colour(scene: Scene):
+def test_colour_points_use_nearest_photo(scene: Scene):
     images = torch.zeros(4, 16, 16, 3, dtype=torch.uint8)
     images[:] = torch.tensor([10, 20, 30, 40])[:, None, None, None]
-    views = Views.of(images, scene.train.cameras)
+    views = Views.from_images(images, scene.train.cameras)
     c2w = scene.train.cameras.c2w
     near = c2w[2, :3, 3] + 0.5 * c2w[2, :3, 2]
     behind = scene.train.cameras.centres.mean(0) + 1e3 * torch.tensor([0.0, 0.0, 1.0])
@@ -92,7 +92,7 @@ def test_view_without_viser_names_the_extra(monkeypatch: pytest.MonkeyPatch):
         view(Path("any.npz"))
 
 
-def test_announce_says_who_can_see_the_page_and_refuses_another_machines_address():
+def test_announce_names_visibility_and_rejects_foreign_address():
     for host in ("192.0.2.1", ""):
         with pytest.raises(InputError, match="127.0.0.1 for this machine alone"):
             resolve_host(host)
@@ -101,7 +101,7 @@ def test_announce_says_who_can_see_the_page_and_refuses_another_machines_address
     assert "http://127.0.0.1:9000; shared with the network" in announce("lego", "0.0.0.0", 0, 9000)
 
 
-def test_has_run_tells_runs_from_scenes(scene: Scene, small_run: Path, tmp_path: Path):
+def test_has_run_distinguishes_runs_from_scenes(scene: Scene, small_run: Path, tmp_path: Path):
     save_npz(scene, tmp_path / "scene.npz")
     shutil.copytree(small_run, tmp_path / "runs" / "first")
     shutil.copytree(small_run, tmp_path / "photos" / "outputs" / "first")
@@ -113,7 +113,7 @@ def test_has_run_tells_runs_from_scenes(scene: Scene, small_run: Path, tmp_path:
     assert {name: has_run(tmp_path / name) for name in expected} == expected
 
 
-def test_view_ends_with_ctrl_c_and_writes_nothing(scene: Scene, tmp_path: Path):
+def test_view_ctrl_c_writes_nothing(scene: Scene, tmp_path: Path):
     save_npz(scene, tmp_path / "small.npz")
     code = "from nerf_lightning.cli.app import main; main()"
     called = [sys.executable, "-c", code, "view", "small.npz", "--port", "0"]

@@ -11,12 +11,12 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from nerf_lightning.capture.poses.geometry import inverse
-from nerf_lightning.capture.poses.pose import Hypothesis
+from nerf_lightning.capture.poses.geometry import invert_pose
+from nerf_lightning.capture.poses.planar_pnp import Hypothesis
 
-NEIGHBOUR_PHOTOS = 1.5, 2.0, 3.0
+NEIGHBOUR_STD_PHOTOS = 1.5, 2.0, 3.0
 """Standard deviations, in photos, of the weights of neighbours; the one that predicts best is taken."""
-ROUNDS = 10
+NUM_ITERATIONS = 10
 JUMP_PROBABILITY = 0.01
 """That a photo was taken from anywhere, whatever its neighbours."""
 MIN_PHOTOS = 4
@@ -36,18 +36,19 @@ def resolve_flips(hypotheses: Sequence[Sequence[Hypothesis]], points: Sequence[F
     if len(hypotheses) < MIN_PHOTOS:
         return [0] * len(hypotheses)
     # Six numbers were fitted to each photo: the remaining residuals are the noise.
-    spare = sum(max(2 * len(seen) - 6, 1) for seen in points)
-    variance = max(sum(options[0].squares for options in hypotheses) / spare, 1e-4)
+    spare = sum(max(2 * len(visible_points) - 6, 1) for visible_points in points)
+    variance = max(sum(options[0].sum_of_squares for options in hypotheses) / spare, 1e-4)
     likelihoods = [
-        np.exp([(options[0].squares - h.squares) / (2 * variance) for h in options]) for options in hypotheses
+        np.exp([(options[0].sum_of_squares - h.sum_of_squares) / (2 * variance) for h in options])
+        for options in hypotheses
     ]
-    middle = np.median([seen.mean(0) for seen in points], axis=0)
-    offsets = [np.stack([inverse(h.pose)[:3, 3] - middle for h in options]) for options in hypotheses]
+    middle = np.median([visible_points.mean(0) for visible_points in points], axis=0)
+    offsets = [np.stack([invert_pose(h.pose)[:3, 3] - middle for h in options]) for options in hypotheses]
     directions = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in offsets]
-    apart = np.subtract.outer(np.arange(len(points)), np.arange(len(points)))
-    kernels = [np.exp(-((apart / width) ** 2) / 2) * (apart != 0) for width in NEIGHBOUR_PHOTOS]
+    lag = np.subtract.outer(np.arange(len(points)), np.arange(len(points)))
+    kernels = [np.exp(-((lag / width) ** 2) / 2) * (lag != 0) for width in NEIGHBOUR_STD_PHOTOS]
     posteriors = [likelihood / likelihood.sum() for likelihood in likelihoods]
-    for _ in range(ROUNDS):
+    for _ in range(NUM_ITERATIONS):
         means = np.stack([posterior @ each for posterior, each in zip(posteriors, directions, strict=True)])
         fits = []
         for kernel in kernels:

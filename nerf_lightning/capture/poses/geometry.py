@@ -10,7 +10,7 @@ from nerf_lightning.cameras.lenses import undistort
 from nerf_lightning.dataset.intrinsics import Intrinsics
 
 
-def to_matrix(rotation: Float[np.ndarray, "3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+def rotvec_to_matrix(rotation: Float[np.ndarray, "3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """Rotation vector and translation to [R t; 0 1]."""
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_rotvec(rotation).as_matrix()
@@ -18,7 +18,7 @@ def to_matrix(rotation: Float[np.ndarray, "3"], translation: Float[np.ndarray, "
     return matrix
 
 
-def inverse(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
+def invert_pose(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """[R t; 0 1]^-1 = [R^T -R^T t; 0 1]."""
     out = np.eye(4)
     out[:3, :3] = matrix[:3, :3].T
@@ -32,22 +32,22 @@ def angle_between(a: Float[np.ndarray, "4 4"], b: Float[np.ndarray, "4 4"]) -> f
     return 2 * float(np.arcsin(min(1.0, chord)))
 
 
-def move(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M 3"]:
+def apply_pose(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "M 3"]:
     """Points after a rigid motion."""
     return points @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def project(
+def project_points(
     lens: Intrinsics, w2c: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "M 2"]:
     """Where a photo shows points of the world; pixel centres at +0.5, as in `lens`."""
-    there = move(w2c, points)[:, None]
-    pixels, _ = cv2.projectPoints(there, np.zeros(3), np.zeros(3), lens.K, lens.opencv)
+    camera_points = apply_pose(w2c, points)[:, None]
+    pixels, _ = cv2.projectPoints(camera_points, np.zeros(3), np.zeros(3), lens.K, lens.opencv_distortion)
     return np.asarray(pixels).reshape(-1, 2)
 
 
-def normalised(lens: Intrinsics, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
+def normalize_pixels(lens: Intrinsics, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
     """Pixels as tangents x / z, y / z in the camera frame, the lens's distortion undone."""
     coefficients = torch.tensor([lens.distortion], dtype=torch.float64)
-    seen = (pixels - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
-    return undistort(torch.from_numpy(seen), coefficients).numpy()
+    centred = (pixels - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
+    return undistort(torch.from_numpy(centred), coefficients).numpy()

@@ -10,25 +10,25 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from nerf_lightning.capture.tags.layout import SQUARE
-from nerf_lightning.dataset.formats.decode import read_pixels
+from nerf_lightning.capture.tags.tag_layout import UNIT_SQUARE
+from nerf_lightning.dataset.formats.image_files import read_pixels
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.progress import tracked
+from nerf_lightning.utils.progress import track_progress
 from nerf_lightning.utils.text import subsample
 
-COMMON_FAMILIES = (
+COMMON_DICTIONARIES = (
     *(f"DICT_{side}X{side}_{count}" for count in (50, 1000) for side in (4, 5, 6, 7)),
     *("DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11", "DICT_APRILTAG_25h9", "DICT_APRILTAG_16h5"),
 )
 """What `auto` tries, small families first: the small one of a kind holds the first patterns of the large one."""
-GUESS_SIDE = 1600
+GUESS_SIDE_PX = 1600
 """Longest side in pixels at which `auto` looks for a family."""
-THREADS = 2
+NUM_THREADS = 2
 
 
 @dataclass(frozen=True)
-class Mark:
+class TagDetection:
     """Known points of one tag (or board) and where a photo shows them."""
 
     points: Float[np.ndarray, "M 3"]
@@ -38,13 +38,13 @@ class Mark:
 
 
 @dataclass(frozen=True)
-class Sighting:
+class PhotoObservation:
     """What one photo shows."""
 
     path: Path
     width: int
     height: int
-    marks: dict[int, Mark]
+    detections: dict[int, TagDetection]
     """By the tag's id."""
 
     @property
@@ -52,11 +52,11 @@ class Sighting:
         return self.path.name
 
 
-Detector = Callable[[UInt8[np.ndarray, "H W"]], dict[int, Mark]]
+Detector = Callable[[UInt8[np.ndarray, "H W"]], dict[int, TagDetection]]
 """Finds marks in a grey photo."""
 
 
-def family(name: str) -> "cv2.aruco.Dictionary":
+def get_dictionary(name: str) -> "cv2.aruco.Dictionary":
     """The predefined dictionary of this name.
 
     Raises:
@@ -64,11 +64,11 @@ def family(name: str) -> "cv2.aruco.Dictionary":
     """
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if number is None:
-        raise InputError("capture", "dictionary", name, f"auto, or a name such as {', '.join(COMMON_FAMILIES[:4])}")
+        raise InputError("capture", "dictionary", name, f"auto, or a name such as {', '.join(COMMON_DICTIONARIES[:4])}")
     return cv2.aruco.getPredefinedDictionary(number)
 
 
-def tag_detector(dictionary: str, size: float) -> Detector:
+def make_tag_detector(dictionary: str, size: float) -> Detector:
     """A detector of single square tags.
 
     Corners are refined by `cornerSubPix` within the tag's own neighbourhood. OpenCV puts pixel centres at integers, so half a
@@ -83,15 +83,15 @@ def tag_detector(dictionary: str, size: float) -> Detector:
     parameters.cornerRefinementWinSize = 30  # OpenCV takes 0.3 modules where that is less: sharp photos are large
     parameters.cornerRefinementMinAccuracy = 0.005
     parameters.cornerRefinementMaxIterations = 100
-    detector = cv2.aruco.ArucoDetector(family(dictionary), parameters)
+    detector = cv2.aruco.ArucoDetector(get_dictionary(dictionary), parameters)
 
-    def detect(grey: UInt8[np.ndarray, "H W"]) -> dict[int, Mark]:
+    def detect(grey: UInt8[np.ndarray, "H W"]) -> dict[int, TagDetection]:
         corners, ids, _ = detector.detectMarkers(grey)
         found = [] if ids is None else [int(i) for i in np.asarray(ids).reshape(-1)]
         twice = {tag for tag, count in Counter(found).items() if count > 1}
         # A tag seen twice is a reflection, a second print or a mistake: there is no telling which one is meant.
         return {
-            tag: Mark(size * SQUARE, np.asarray(four, np.float64).reshape(4, 2) + 0.5)
+            tag: TagDetection(size * UNIT_SQUARE, np.asarray(four, np.float64).reshape(4, 2) + 0.5)
             for tag, four in zip(found, corners, strict=True)
             if tag not in twice
         }
@@ -104,18 +104,20 @@ def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
     return cv2.cvtColor(read_pixels(path, upright=True)[..., :3], cv2.COLOR_RGB2GRAY)
 
 
-def detect_in_photos(paths: Sequence[Path], detector: Detector) -> list[Sighting]:
+def detect_tags(paths: Sequence[Path], detector: Detector) -> list[PhotoObservation]:
     """Looks for marks in photos, in the order given."""
 
-    def look(path: Path) -> Sighting:
+    def look(path: Path) -> PhotoObservation:
         grey = read_grey(path)
-        return Sighting(path, grey.shape[1], grey.shape[0], detector(grey))
+        return PhotoObservation(path, grey.shape[1], grey.shape[0], detector(grey))
 
-    with ThreadPoolExecutor(THREADS) as pool:
-        return list(tracked(pool.map(look, paths), len(paths), "looking for tags"))
+    with ThreadPoolExecutor(NUM_THREADS) as pool:
+        return list(track_progress(pool.map(look, paths), len(paths), "looking for tags"))
 
 
-def find_wrong_sizes(folder: Path, photos: Sequence[Sighting], size: tuple[int, int] | None = None) -> dict[str, str]:
+def find_wrong_sizes(
+    folder: Path, photos: Sequence[PhotoObservation], size: tuple[int, int] | None = None
+) -> dict[str, str]:
     """Photos that do not have the commonest size (or `size`, that of the calibration), and what is wrong with each.
 
     Raises:
@@ -135,7 +137,7 @@ def find_wrong_sizes(folder: Path, photos: Sequence[Sighting], size: tuple[int, 
     return wrong
 
 
-def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
+def guess_dictionary(paths: Sequence[Path], photos: int = 4) -> str:
     """The family with most tags in a few of the photos.
 
     Raises:
@@ -144,16 +146,16 @@ def guess_family(paths: Sequence[Path], photos: int = 4) -> str:
     small = []
     for i in subsample(len(paths), photos):
         grey = read_grey(paths[i])
-        size = fit_size(grey.shape[1], grey.shape[0], GUESS_SIDE)
+        size = fit_size(grey.shape[1], grey.shape[0], GUESS_SIDE_PX)
         small.append(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
     counts = {}
-    for name in COMMON_FAMILIES:
+    for name in COMMON_DICTIONARIES:
         # Without error correction: a few wrong bits turn clutter into tags of the larger families.
         parameters = cv2.aruco.DetectorParameters()
         parameters.errorCorrectionRate = 0.0
-        detector = cv2.aruco.ArucoDetector(family(name), parameters)
+        detector = cv2.aruco.ArucoDetector(get_dictionary(name), parameters)
         counts[name] = sum(len(detector.detectMarkers(grey)[0]) for grey in small)
-    best = max(COMMON_FAMILIES, key=counts.__getitem__)
+    best = max(COMMON_DICTIONARIES, key=counts.__getitem__)
     if not counts[best]:
         found = f"no tag of a common family in {len(small)} of {len(paths)} photos"
         advice = "name the family with dictionary if it is an unusual one"

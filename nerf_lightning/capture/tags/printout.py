@@ -8,19 +8,19 @@ from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from nerf_lightning.capture.tags.detect import family
-from nerf_lightning.capture.tags.layout import TagLayout
+from nerf_lightning.capture.tags.detect import get_dictionary
+from nerf_lightning.capture.tags.tag_layout import TagLayout
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic_write
 
-A4 = 0.210, 0.297
+A4_METRES = 0.210, 0.297
 """Metres."""
-RULER = 0.1
+RULER_METRES = 0.1
 """Length of the line that shows whether the printer kept the size, metres."""
-INCH = 0.0254
+METRES_PER_INCH = 0.0254
 
 
-def write_page(layout: TagLayout, file: Path) -> None:
+def write_sheet_pdf(layout: TagLayout, file: Path) -> None:
     """Writes a flat sheet of tags as a PDF of its true size.
 
     Raises:
@@ -28,31 +28,33 @@ def write_page(layout: TagLayout, file: Path) -> None:
     """
     if file.suffix.lower() != ".pdf":
         raise InputError("print-tags", "sheet", str(file), "a file name that ends in .pdf")
-    figure = page(layout)
-    with atomic(file) as temporary:
+    figure = draw_sheet(layout)
+    with atomic_write(file) as temporary:
         FigureCanvasPdf(figure).print_pdf(temporary)
 
 
-def page(layout: TagLayout) -> Figure:
+def draw_sheet(layout: TagLayout) -> Figure:
     """A flat sheet of tags in the middle of an A4 page.
 
     Raises:
         InputError: the tags do not fit on the page, or are not in the family.
     """
-    patterns = family(layout.dictionary)
+    patterns = get_dictionary(layout.dictionary)
     if (last := max(layout.poses)) >= len(patterns.bytesList):
         expected = f"one of the {len(patterns.bytesList)} tags of {layout.dictionary}"
         raise InputError("print-tags", "layout", f"tag {last}", expected, "name a larger family with dictionary")
     corners = np.concatenate([layout.corners(tag)[:, :2] for tag in layout.poses])
     low, high = corners.min(0), corners.max(0)
     rim = layout.size / 6
-    if (high - low + 2 * rim > A4).any():
+    if (high - low + 2 * rim > A4_METRES).any():
         found = f"{1000 * (high - low)[0]:.0f} x {1000 * (high - low)[1]:.0f} mm of tags"
         raise InputError("print-tags", "tag_size", found, "no more than an A4 page with a white rim holds", "give less")
-    figure = Figure(figsize=(A4[0] / INCH, A4[1] / INCH))
+    figure = Figure(figsize=(A4_METRES[0] / METRES_PER_INCH, A4_METRES[1] / METRES_PER_INCH))
     axes = figure.add_axes((0, 0, 1, 1))
     centre = (low + high) / 2
-    axes.set(xlim=centre[0] + np.array([-0.5, 0.5]) * A4[0], ylim=centre[1] + np.array([-0.5, 0.5]) * A4[1])
+    axes.set(
+        xlim=centre[0] + np.array([-0.5, 0.5]) * A4_METRES[0], ylim=centre[1] + np.array([-0.5, 0.5]) * A4_METRES[1]
+    )
     axes.set_axis_off()
     side = patterns.markerSize + 2
     module = layout.size / side
@@ -65,7 +67,7 @@ def page(layout: TagLayout) -> Figure:
             # The line hides seams between neighbours.
             axes.add_patch(Rectangle((x, y), module, module, angle=turn, color="black", linewidth=0.2))
     words = f"{layout.dictionary}, tags of {100 * layout.size:g} cm. Print without scaling: this line is 10 cm long."
-    bottom = centre[1] - A4[1] / 2 + 0.009
-    axes.plot(centre[0] + np.array([-0.5, 0.5]) * RULER, [bottom, bottom], color="black", linewidth=0.8)
+    bottom = centre[1] - A4_METRES[1] / 2 + 0.009
+    axes.plot(centre[0] + np.array([-0.5, 0.5]) * RULER_METRES, [bottom, bottom], color="black", linewidth=0.8)
     axes.text(centre[0], bottom + 0.002, words, ha="center", va="bottom", fontsize=7)
     return figure

@@ -13,18 +13,18 @@ from nerf_lightning.utils.memory import check_memory
 
 log = logging.getLogger(__name__)
 
-BYTES_PER_PIXEL = 20
+BYTES_PER_RENDERED_PIXEL = 20
 """Memory for a pixel of a rendered view: colour, depth and opacity as floats."""
 RIGID_TOLERANCE = 1e-3
 """How far R^T R may stand from the identity, entry by entry; files that print six digits stay well below."""
-FARTHEST, NEAREST = 1e12, 1e-12
+MAX_COORDINATE, MIN_CAMERA_DISTANCE = 1e12, 1e-12
 """Largest coordinate, and smallest distance of cameras from what they look at, in a file's unit: single precision holds the
 cubes of these lengths, which a similarity's scale is taken from, and no more."""
-MAX_PIXELS = 2.0**23
+MAX_FOCAL_PX = 2.0**23
 """Largest focal length, and largest place on a sensor: single precision cannot tell two pixels apart beyond."""
-STEP = 2.0**-23
+FLOAT32_EPS = 2.0**-23
 """Between neighbouring numbers of single precision, as a share of them."""
-MIN_OTHER_SIZE, MAX_ASPECT_ERROR = 1.8, 0.25
+MIN_CENTRE_RATIO, MAX_ASPECT_ERROR = 1.8, 0.25
 """Least ratio of a principal point to the middle, along both axes alike, that tells of photos of another size."""
 
 
@@ -83,7 +83,7 @@ def check_poses(where: object, label: str, value: Any) -> Float[np.ndarray, "V 4
         "another bottom row: is it transposed?": np.abs(poses[:, 3] - [0, 0, 0, 1]).max(1) > RIGID_TOLERANCE,
         "no rotation (R^T R is not 1), but shear or scale": ~is_orthonormal(poses[:, :3, :3]),
         "a mirror (det R = -1): left-handed axes": np.linalg.det(poses[:, :3, :3]) < 0,
-        f"a camera farther away than {FARTHEST:g}": np.abs(poses[:, :3, 3]).max(1) > FARTHEST,
+        f"a camera farther away than {MAX_COORDINATE:g}": np.abs(poses[:, :3, 3]).max(1) > MAX_COORDINATE,
     }
     for found, wrong in problems.items():
         if wrong.any():
@@ -106,13 +106,15 @@ def check_similarity(where: object, key: str, value: Any) -> Float[np.ndarray, "
     matrix = parse_array(where, key, value, 4, 4)
     scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
     is_similarity = (
-        NEAREST <= scale <= FARTHEST
-        and np.abs(matrix[:3, 3]).max() <= FARTHEST
+        MIN_CAMERA_DISTANCE <= scale <= MAX_COORDINATE
+        and np.abs(matrix[:3, 3]).max() <= MAX_COORDINATE
         and is_orthonormal(matrix[None, :3, :3] / scale)[0]
         and np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE)
     )
     if not is_similarity:
-        expected = f"a similarity [s R t; 0 0 0 1]: a rotation times a scale, and a shift, of at most {FARTHEST:g}"
+        expected = (
+            f"a similarity [s R t; 0 0 0 1]: a rotation times a scale, and a shift, of at most {MAX_COORDINATE:g}"
+        )
         raise InputError(where, key, str(matrix.tolist()), expected, "leave it out: the frame is the file's own")
     return matrix
 
@@ -122,16 +124,16 @@ def check_split_size(where: object, key: str, count: int) -> None:
         raise InputError(where, key, "0 views", "at least one", "a scene needs training and held-out views")
 
 
-def check_optics(where: object, key: str, optics: Intrinsics) -> Intrinsics:
+def check_camera(where: object, key: str, intrinsics: Intrinsics) -> Intrinsics:
     """The optics, if a camera can have its size, intrinsics and distortion."""
-    o = optics
-    if not (1 <= o.width <= MAX_PIXELS and 1 <= o.height <= MAX_PIXELS):
+    o = intrinsics
+    if not (1 <= o.width <= MAX_FOCAL_PX and 1 <= o.height <= MAX_FOCAL_PX):
         raise InputError(where, key, f"{o.width:g}x{o.height:g} pixels", "the size of a photo")
     check_intrinsics(where, key, o.K, o.width, o.height)
-    if not o.sees_every_pixel():
+    if not o.is_invertible():
         found = ", ".join(f"{name}={value:g}" for name, value in o.distortion._asdict().items() if value)
         raise InputError(where, key, f"a distortion that folds the photo over ({found})", "that of a real lens")
-    return optics
+    return intrinsics
 
 
 def check_intrinsics(where: object, key: str, value: Any, width: int, height: int) -> Float[np.ndarray, "3 3"]:
@@ -142,12 +144,12 @@ def check_intrinsics(where: object, key: str, value: Any, width: int, height: in
     K = parse_array(where, key, value, 3, 3)
     if K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
         raise InputError(where, key, str(K.tolist()), "[[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels")
-    least = max(width, height) / MAX_PIXELS
-    if not min(K[0, 0], K[1, 1]) >= least or np.abs(K).max() > MAX_PIXELS:
-        expected = f"focal lengths of at least {least:.2g} pixels, none of these numbers above {MAX_PIXELS:.0f}"
+    least = max(width, height) / MAX_FOCAL_PX
+    if not min(K[0, 0], K[1, 1]) >= least or np.abs(K).max() > MAX_FOCAL_PX:
+        expected = f"focal lengths of at least {least:.2g} pixels, none of these numbers above {MAX_FOCAL_PX:.0f}"
         raise InputError(where, key, str(K.tolist()), expected, "are they in pixels?")
     across, down = 2 * K[0, 2] / width, 2 * K[1, 2] / height
-    if min(across, down) > MIN_OTHER_SIZE and abs(across / down - 1) < MAX_ASPECT_ERROR:
+    if min(across, down) > MIN_CENTRE_RATIO and abs(across / down - 1) < MAX_ASPECT_ERROR:
         found = (
             f"{K[0, 2]:g}, {K[1, 2]:g}, the middle of photos {across:.3g} times as large as these, of {width}x{height}"
         )
@@ -157,8 +159,8 @@ def check_intrinsics(where: object, key: str, value: Any, width: int, height: in
 
 def check_near_far(where: object, near: float | None, far: float | None) -> None:
     for key, distance in (("near", near), ("far", far)):
-        if distance is not None and not 0 <= distance <= FARTHEST:
-            raise InputError(where, key, f"{distance:g}", f"a distance from 0 to {FARTHEST:g}")
+        if distance is not None and not 0 <= distance <= MAX_COORDINATE:
+            raise InputError(where, key, f"{distance:g}", f"a distance from 0 to {MAX_COORDINATE:g}")
     if far is not None and far <= (near or 0.0):
         raise InputError(where, "far", f"{far:g}", f"more than near, {near or 0.0:g}")
 
@@ -166,8 +168,8 @@ def check_near_far(where: object, near: float | None, far: float | None) -> None
 def check_box(where: object, key: str, value: Any) -> Float[np.ndarray, "2 3"]:
     aabb = parse_array(where, key, value, 2, 3)
     low, high = aabb.astype(np.float32)  # as it will be used
-    if np.abs(aabb).max() > FARTHEST or not (high - low > NEAREST).all():
-        expected = f"a lower corner below the upper one on each axis, coordinates of at most {FARTHEST:g}"
+    if np.abs(aabb).max() > MAX_COORDINATE or not (high - low > MIN_CAMERA_DISTANCE).all():
+        expected = f"a lower corner below the upper one on each axis, coordinates of at most {MAX_COORDINATE:g}"
         raise InputError(where, key, str(aabb.tolist()), expected)
     return aabb
 
@@ -178,5 +180,5 @@ def check_view_size(where: object, key: str, width: object, height: object) -> t
         if not isinstance(side, int) or isinstance(side, bool) or side < 1:
             raise InputError(where, key, repr(side)[:60], "a width and a height, each at least one pixel")
     assert isinstance(width, int) and isinstance(height, int)  # as was just checked
-    check_memory(where, key, f"{width}x{height} pixels", BYTES_PER_PIXEL * width * height)
+    check_memory(where, key, f"{width}x{height} pixels", BYTES_PER_RENDERED_PIXEL * width * height)
     return width, height

@@ -4,13 +4,13 @@ import logging
 import os
 from pathlib import Path
 
-from nerf_lightning.dataset.formats.colmap_model import FILES, find_files, read_model
-from nerf_lightning.dataset.formats.names import find_images, keep_present, list_images, walk_images
+from nerf_lightning.dataset.formats.colmap_model import MODEL_FILES, find_model_files, read_model
+from nerf_lightning.dataset.formats.file_names import drop_missing, find_images, list_images, walk_images
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.orientation import choose_orientations
-from nerf_lightning.dataset.posed import Hints, build_scene
+from nerf_lightning.dataset.photo_loading import DEFAULT_OPTIONS, PhotoLoadOptions, PosedPhoto
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions, Shot
+from nerf_lightning.dataset.scene_builder import Hints, build_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.text import join_truncated
 
@@ -21,32 +21,32 @@ PHOTO_FOLDERS = ("images", "input", "")
 REDUCED_FOLDERS = tuple(f"{name}_{factor}" for name in ("images", "input") for factor in (2, 4, 8))
 MAX_MODEL_DEPTH = 4
 """Folders below a scene's in which a model is looked for."""
-SHOWN = 5
+MAX_SHOWN = 5
 """Names in a message."""
 
 
-def find_models(place: Path) -> list[Path]:
+def find_models(source: Path) -> list[Path]:
     """Folders of sparse models that a path means, the largest first: itself, or those below it where COLMAP and
     the programs around it put them, such as `sparse/0`; else the one place down to `MAX_MODEL_DEPTH` that has any."""
     found: dict[Path, list[Path]] = {}  # by the folder that holds `0`, `1`, or is the model
-    for name, folders, _ in os.walk(place):
+    for name, folders, _ in os.walk(source):
         folder = Path(name)
-        if len(folder.relative_to(place).parts) >= MAX_MODEL_DEPTH:
+        if len(folder.relative_to(source).parts) >= MAX_MODEL_DEPTH:
             folders.clear()
         folders[:] = sorted(below for below in folders if not below.startswith("."))
-        if find_files(folder):
-            is_numbered = folder.name.isdigit() and folder != place
+        if find_model_files(folder):
+            is_numbered = folder.name.isdigit() and folder != source
             found.setdefault(folder.parent if is_numbered else folder, []).append(folder)
-    usual = [place / name for name in MODEL_FOLDERS if place / name in found]
+    usual = [source / name for name in MODEL_FOLDERS if source / name in found]
     if not usual and len(found) > 1:
-        shown = ", ".join(folder.relative_to(place).as_posix() for folder in sorted(found)[:SHOWN])
-        raise InputError(place, "", f"several COLMAP models: {shown}", "one", "give the path of one of them")
+        shown = ", ".join(folder.relative_to(source).as_posix() for folder in sorted(found)[:MAX_SHOWN])
+        raise InputError(source, "", f"several COLMAP models: {shown}", "one", "give the path of one of them")
     models = found[next(iter(usual or found))] if found else []
-    return sorted(models, key=lambda model: find_files(model)[1].stat().st_size, reverse=True)
+    return sorted(models, key=lambda model: find_model_files(model)[1].stat().st_size, reverse=True)
 
 
 def load_colmap(
-    place: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS, photos: Path | None = None
+    source: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS, photos: Path | None = None
 ) -> Scene:
     """Reads a COLMAP model (world-to-camera poses, inverted here) and its photos, sorted by name.
 
@@ -62,46 +62,46 @@ def load_colmap(
     Raises:
         InputError: no whole model, no photos, or photos that do not fit it.
     """
-    models = find_models(place)
+    models = find_models(source)
     if not models:
-        expected = " and ".join(f"{file}.bin or .txt" for file in FILES[:2])
-        raise InputError(place, "", "no COLMAP model", f"{expected} in it or in sparse/0")
+        expected = " and ".join(f"{file}.bin or .txt" for file in MODEL_FILES[:2])
+        raise InputError(source, "", "no COLMAP model", f"{expected} in it or in sparse/0")
     folder = models[0]
     if len(models) > 1:
         log.warning("%s: the largest model; others: %s", folder, ", ".join(other.name for other in models[1:]))
     images, points = read_model(folder)
     images.sort(key=lambda image: image.name)
     names = [image.name for image in images]
-    root = photos or find_photo_folder(folder, place, names)
-    placed = keep_present(folder, images, find_images(root, names, folder))
+    root = photos or find_photo_folder(folder, source, names)
+    placed = drop_missing(folder, images, find_images(root, names, folder))
     files = [file for _, file in placed]
-    report_unplaced(root, files)
+    warn_unregistered(root, files)
     scene_folder = root.parent if root.name in (*PHOTO_FOLDERS, *REDUCED_FOLDERS) else root
-    sizes = [(image.optics.width, image.optics.height) for image, _ in placed]
+    sizes = [(image.intrinsics.width, image.intrinsics.height) for image, _ in placed]
     turned = choose_orientations(folder, files, sizes, options.orientation)
     shots = [
-        Shot(image.name, file, image.c2w, image.optics, mask, turn)
+        PosedPhoto(image.name, file, image.c2w, image.intrinsics, mask, turn)
         for (image, file), mask, turn in zip(placed, find_masks(files, scene_folder), turned, strict=True)
     ]
-    named = place if scene_folder.resolve().is_relative_to(place.resolve()) else scene_folder
-    return build_scene(place, name or named.resolve().name, shots, options, hints=Hints(points=points))
+    named = source if scene_folder.resolve().is_relative_to(source.resolve()) else scene_folder
+    return build_scene(source, name or named.resolve().name, shots, options, hints=Hints(points=points))
 
 
-def find_photo_folder(model: Path, place: Path, names: list[str]) -> Path:
+def find_photo_folder(model: Path, source: Path, names: list[str]) -> Path:
     """The folder that holds a model's photos: `images`, `input`, itself or `images_2` to `images_8`, from the model's up."""
     order = ("input", "images", "") if "distorted" in model.parts else PHOTO_FOLDERS
     above = [model, *list(model.resolve().parents)[:4]]
     tried = [parent / name for names in (order, REDUCED_FOLDERS) for parent in above for name in names]
     for folder in tried:
-        if any(os.path.isfile(folder / name) for name in names[:SHOWN]):
+        if any(os.path.isfile(folder / name) for name in names[:MAX_SHOWN]):
             return folder
     named = [folder for folder in tried if folder.name in (*order, *REDUCED_FOLDERS)]
-    return next((folder for folder in named if next(walk_images(folder), None)), place)
+    return next((folder for folder in named if next(walk_images(folder), None)), source)
 
 
-def report_unplaced(root: Path, placed: list[Path]) -> None:
+def warn_unregistered(root: Path, placed: list[Path]) -> None:
     """Names photos beside the placed ones that the model does not place."""
     left = sorted({file for folder in {file.parent for file in placed} for file in list_images(folder)} - set(placed))
     if left:
-        names = join_truncated([file.name for file in left], SHOWN)
+        names = join_truncated([file.name for file in left], MAX_SHOWN)
         log.warning("%s: %d photos have no place in the model, %s: left out", root, len(left), names)

@@ -14,24 +14,24 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset.formats import checks
-from nerf_lightning.dataset.posed import Hints, assemble_scene, split_shots
-from nerf_lightning.dataset.resize import area_resize, choose_resize, fit_size
+from nerf_lightning.dataset.photo_loading import DEFAULT_OPTIONS, PhotoLoadOptions
+from nerf_lightning.dataset.resize import choose_resize, fit_size, resize_area
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions
+from nerf_lightning.dataset.scene_builder import Hints, assemble_scene, split_photos
 from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
-from nerf_lightning.utils.files import atomic
+from nerf_lightning.utils.files import atomic_write
 from nerf_lightning.utils.parsing import read_npz
 
 log = logging.getLogger(__name__)
 
-NEEDED = ("images_train", "c2ws_train")
-PAIRS = {"images_train": "c2ws_train", "images_val": "c2ws_val", "images_test": "c2ws_test"}
+REQUIRED_KEYS = ("images_train", "c2ws_train")
+POSE_KEYS = {"images_train": "c2ws_train", "images_val": "c2ws_val", "images_test": "c2ws_test"}
 """Images of each split, and their poses."""
-OTHERS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
+OPTIONAL_KEYS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
 
 
-def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS) -> Scene:
+def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
     """Reads the course format. Poses are OpenCV camera to world already: nothing is converted.
 
     Entries, with V views a split:
@@ -41,32 +41,32 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
             absent.
         focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which then rules.
         near, far: distances along the rays, and aabb: (2, 3), world units, with unbounded: whether content lies outside aabb
-            too; without aabb the photos decide, see `decide_kind`.
+            too; without aabb the photos decide, see `classify_scene`.
         background: (3,), sRGB; if absent the one colour along the photos' borders, or black.
         to_source: (4, 4), similarity to the frame of the original, identity if absent.
 
     Raises:
         InputError: anything missing, malformed or contradictory.
     """
-    data = read_npz(path, (*PAIRS, *PAIRS.values(), *OTHERS))
-    checks.require_keys(path, data, NEEDED)
-    images = {key: read_images(path, key, data) for key in PAIRS if key in data}
+    data = read_npz(path, (*POSE_KEYS, *POSE_KEYS.values(), *OPTIONAL_KEYS))
+    checks.require_keys(path, data, REQUIRED_KEYS)
+    images = {key: read_images(path, key, data) for key in POSE_KEYS if key in data}
     count, height, width, channels = images["images_train"].shape
     size = fit_size(width, height, choose_resize(path, [(width, height)] * count, channels, options.resize))
     K = read_intrinsics(path, data, width, height)
 
     def read_poses(key: str) -> Cameras:
         c2w = torch.from_numpy(checks.check_poses(path, key + "[{}]", data[key]))
-        return Cameras.of_size(K.repeat(len(c2w), 1, 1), c2w, width, height).resized(size)
+        return Cameras.pinhole(K.repeat(len(c2w), 1, 1), c2w, width, height).resize(size)
 
     def make_views(key: str, stack: UInt8[np.ndarray, "V H W C"]) -> Views:
-        resized = stack if size == (width, height) else np.stack([area_resize(image, *size) for image in stack])
-        return Views.of(torch.from_numpy(resized), read_poses(PAIRS[key]))
+        resized = stack if size == (width, height) else np.stack([resize_area(image, *size) for image in stack])
+        return Views.from_images(torch.from_numpy(resized), read_poses(POSE_KEYS[key]))
 
     train, *held_out = (make_views(key, stack) for key, stack in images.items())
     if not held_out:
         log.warning("%s: no held-out photos: every %d-th training photo is held out", path, options.holdout)
-        split = split_shots(path, len(train), options.holdout)
+        split = split_photos(path, len(train), options.holdout)
         train, val = (train[torch.tensor(part)] for part in (split.train, split.val))
         held_out = [val]
     near, far = (checks.parse_number(path, key, data[key]) if key in data else None for key in ("near", "far"))
@@ -74,7 +74,7 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
     has_path = "c2ws_test" in data and "images_test" not in data
     hints = Hints(
         keep_frame=True,
-        path=read_poses("c2ws_test") if has_path else None,
+        camera_path=read_poses("c2ws_test") if has_path else None,
         background=read_background(path, data["background"]) if "background" in data else None,
         bounds=read_bounds(path, data, options) if "aabb" in data else None,
         to_source=checks.check_similarity(path, "to_source", data["to_source"]) if "to_source" in data else None,
@@ -88,14 +88,14 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = AS
 def read_images(path: Path, key: str, data: Mapping[str, np.ndarray]) -> UInt8[np.ndarray, "V H W C"]:
     """The images of a split as uint8; floats in [0, 1] are scaled and rounded."""
     images, one = data[key], data["images_train"].shape[1:]
-    checks.require_keys(path, data, [PAIRS[key]])
+    checks.require_keys(path, data, [POSE_KEYS[key]])
     if images.ndim != 4 or images.shape[3] not in (3, 4) or (images.dtype != np.uint8 and images.dtype.kind != "f"):
         expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
         raise InputError(path, key, f"shape {images.shape}, {images.dtype}", expected)
     checks.check_split_size(path, key, images.size)
     if images.shape[1:] != one:
         raise InputError(path, key, f"shape {images.shape}", f"images of shape {one}, as in images_train")
-    if (poses := data[PAIRS[key]].shape[:1]) != images.shape[:1]:
+    if (poses := data[POSE_KEYS[key]].shape[:1]) != images.shape[:1]:
         raise InputError(path, key, f"{len(images)} images for {math.prod(poses)} poses", "one pose for each image")
     if images.dtype == np.uint8:
         return images
@@ -155,5 +155,5 @@ def save_npz(scene: Scene, path: Path) -> None:
         "background": scene.background if any(scene.background) else None,
     }
     content: dict[str, Any] = {key: np.asarray(value) for key, value in arrays.items() if value is not None}
-    with atomic(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         np.savez_compressed(file, **content)

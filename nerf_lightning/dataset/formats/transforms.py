@@ -9,15 +9,15 @@ import numpy as np
 import torch
 
 from nerf_lightning.cameras import Cameras
-from nerf_lightning.dataset.formats.decode import image_header
-from nerf_lightning.dataset.formats.frames import Frame, read_frames, read_optics, read_size
-from nerf_lightning.dataset.formats.names import find_images, fold_name, keep_present
+from nerf_lightning.dataset.formats.file_names import drop_missing, find_images, normalize_name
+from nerf_lightning.dataset.formats.image_files import read_image_size
+from nerf_lightning.dataset.formats.transforms_json import Frame, read_frames, read_intrinsics, read_size
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.masks import find_masks
 from nerf_lightning.dataset.orientation import choose_orientations
-from nerf_lightning.dataset.posed import Hints, Split, build_scene
+from nerf_lightning.dataset.photo_loading import DEFAULT_OPTIONS, PhotoLoadOptions, PosedPhoto
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.shots import AS_IT_IS, PhotoLoadOptions, Shot
+from nerf_lightning.dataset.scene_builder import Hints, Split, build_scene
 from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 WHITE = (1.0, 1.0, 1.0)
 
 
-def load_transforms(path: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS) -> Scene:
+def load_transforms(path: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
     """Reads transforms.json: OpenGL camera-to-world poses, converted to OpenCV here.
 
     Frames whose photo is not there are left out with a warning, as instant-ngp does (its own fox is shipped so), unless
@@ -42,14 +42,14 @@ def load_transforms(path: Path, name: str | None = None, options: PhotoLoadOptio
     file = path / "transforms.json" if path.is_dir() else path
     frames = sorted(read_frames(file), key=lambda frame: frame.name)
     names = [frame.name for frame in frames]
-    photos = keep_present(file, frames, find_images(file.parent, names, file))
+    photos = drop_missing(file, frames, find_images(file.parent, names, file))
     split = read_split(file, frames[0].values, names, [frame.name for frame, _ in photos])
     folder = file.resolve().parent
-    shots = make_shots(file, photos, folder, options)
+    shots = make_posed_photos(file, photos, folder, options)
     return build_scene(path, name or (folder.name if file.stem == "transforms" else file.stem), shots, options, split)
 
 
-def load_blender(folder: Path, name: str | None = None, options: PhotoLoadOptions = AS_IT_IS) -> Scene:
+def load_blender(folder: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
     """Reads transforms_train.json, transforms_val.json and transforms_test.json, as the NeRF paper's renders have them.
 
     Every key of transforms.json counts. Held out is the val split, or test where val has no photos; with both, test is
@@ -79,14 +79,14 @@ def load_blender(folder: Path, name: str | None = None, options: PhotoLoadOption
             log.warning("%s: none of its %d photos is there: taken as a camera path", split, len(frames))
             path = frames
             continue
-        present = keep_present(folder / f"transforms_{split}.json", frames, files)
+        present = drop_missing(folder / f"transforms_{split}.json", frames, files)
         parts.append(list(range(len(photos), len(photos) + len(present))))
         photos += present
-    shots = make_shots(folder, photos, folder, options)
+    shots = make_posed_photos(folder, photos, folder, options)
     if len(parts) == 1:
         log.warning("%s: no held-out photos: every %d-th training photo is held out", folder, options.holdout)
     parted = Split(*parts) if parts[1:] else None
-    hints = Hints(WHITE, keep_frame=True, path=make_path(path, shots[0].optics) if path else None)
+    hints = Hints(WHITE, keep_frame=True, camera_path=make_camera_path(path, shots[0].intrinsics) if path else None)
     return build_scene(folder, name or folder.resolve().name, shots, options, parted, hints)
 
 
@@ -102,15 +102,15 @@ def read_split(file: Path, content: Mapping[str, Any], names: Sequence[str], pre
     Raises:
         InputError: names that are no frame's, or photos in two parts of it.
     """
-    known, named = {fold_name(name) for name in names}, dict[str, list[int]]()
+    known, named = {normalize_name(name) for name in names}, dict[str, list[int]]()
     for part in ("train", "val", "test"):
         given = content.get(key := f"{part}_filenames") or []
         if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
             raise InputError(file, key, repr(given)[:60], "a list of file_path strings")
-        if strangers := [item for item in given if fold_name(item) not in known]:
+        if strangers := [item for item in given if normalize_name(item) not in known]:
             raise InputError(file, key, f"{strangers[0]!r}, which is no frame", "the file_path of a frame")
-        if wanted := {fold_name(item) for item in given}:
-            named[part] = [i for i, name in enumerate(present) if fold_name(name) in wanted]
+        if wanted := {normalize_name(item) for item in given}:
+            named[part] = [i for i, name in enumerate(present) if normalize_name(name) in wanted]
     if not named:
         return None
     rest = sorted(set(range(len(present))).difference(*named.values()))
@@ -122,17 +122,17 @@ def read_split(file: Path, content: Mapping[str, Any], names: Sequence[str], pre
     return Split(train, val, *(part for part in test if part != val))
 
 
-def make_shots(
+def make_posed_photos(
     source: Path, photos: Sequence[tuple[Frame, Path]], folder: Path, options: PhotoLoadOptions
-) -> list[Shot]:
+) -> list[PosedPhoto]:
     """Posed photos with their intrinsics and masks."""
     stated = [read_size(frame) for frame, _ in photos]
     turned = choose_orientations(source, [file for _, file in photos], stated, options.orientation)
     masks = read_masks(source, photos, folder)
     shots = []
     for (frame, file), size, upright, mask in zip(photos, stated, turned, masks, strict=True):
-        optics = read_optics(frame, *(size or image_header(file, upright)[:2]))
-        shots.append(Shot(frame.name, file, frame.c2w, optics, mask, upright))
+        intrinsics = read_intrinsics(frame, *(size or read_image_size(file, upright)[:2]))
+        shots.append(PosedPhoto(frame.name, file, frame.c2w, intrinsics, mask, upright))
     return shots
 
 
@@ -151,8 +151,8 @@ def read_masks(source: Path, photos: Sequence[tuple[Frame, Path]], folder: Path)
     return masks
 
 
-def make_path(frames: Sequence[Frame], optics: Intrinsics) -> Cameras:
+def make_camera_path(frames: Sequence[Frame], intrinsics: Intrinsics) -> Cameras:
     """Pinhole cameras along the poses of frames without photos, with the intrinsics of a photo."""
     c2w = torch.from_numpy(np.stack([frame.c2w for frame in frames]))
-    K = torch.from_numpy(optics.K).repeat(len(frames), 1, 1)
-    return Cameras.of_size(K.float(), c2w, optics.width, optics.height)
+    K = torch.from_numpy(intrinsics.K).repeat(len(frames), 1, 1)
+    return Cameras.pinhole(K.float(), c2w, intrinsics.width, intrinsics.height)

@@ -17,7 +17,7 @@ MAX_SIDE_PX, MIN_SIDE_PX, MAX_ENLARGEMENT = 320, 256, 3
 """Longest side of a photo when features are detected: larger ones are reduced, smaller ones enlarged."""
 MAX_FEATURES, MAX_COARSE_FEATURES = 400, 128
 """Features of a photo; the first of them tell which photos may overlap."""
-DESCRIPTOR = 128 + 3
+FEATURE_DIM = 128 + 3
 MAX_RATIO = 0.8
 """Largest distance of a match, as a share of the second-best (Lowe 2004, section 7.1)."""
 MIN_COARSE_MATCHES, MIN_MATCHES = 5, 8
@@ -35,7 +35,7 @@ EPIPOLAR_TOLERANCE, MAX_ITERATIONS = 0.004, 500
 class Features:
     """Salient points of a photo."""
 
-    places: Float[np.ndarray, "F 2"]
+    keypoints: Float[np.ndarray, "F 2"]
     """Column and row, pixels of the photo; the first pixel's centre is at 0.5."""
     descriptors: Float[Tensor, "F D"]
     """RootSIFT (Arandjelovic and Zisserman 2012) and sRGB in [0, 1], which tells apart what is alike but for its colour; the
@@ -48,19 +48,19 @@ class Pair:
 
     first: int
     second: int
-    places: Float[np.ndarray, "M 2 2"]
+    keypoints: Float[np.ndarray, "M 2 2"]
     """Of each match in the first and in the second photo, pixels."""
 
     @property
     def displacement(self) -> float:
         """Median distance between a match's two places, pixels."""
-        return float(np.median(np.linalg.norm(self.places[:, 1] - self.places[:, 0], axis=1)))
+        return float(np.median(np.linalg.norm(self.keypoints[:, 1] - self.keypoints[:, 0], axis=1)))
 
 
 def detect_features(views: Views, view: int) -> Features:
     """SIFT features of one of several photos, where it shows something."""
     image = views.image(view).numpy()
-    shows = np.ones(image.shape[:2], bool) if views.known is None else views.mask_of(view).numpy()
+    shows = np.ones(image.shape[:2], bool) if views.valid_mask is None else views.view_mask(view).numpy()
     if image.shape[2] == 4:
         shows = shows & (image[..., 3] > 127)
     height, width = image.shape[:2]
@@ -74,30 +74,30 @@ def detect_features(views: Views, view: int) -> Features:
     sift = cv2.SIFT.create(MAX_FEATURES, contrastThreshold=0.02)
     points, descriptors = sift.detectAndCompute(cv2.cvtColor(colours, cv2.COLOR_RGB2GRAY), mask)
     if descriptors is None or not len(points):
-        return Features(np.zeros((0, 2)), torch.zeros(0, DESCRIPTOR))
+        return Features(np.zeros((0, 2)), torch.zeros(0, FEATURE_DIM))
     order = np.argsort([-point.response for point in points], kind="stable")[:MAX_FEATURES]
-    places = np.array([points[i].pt for i in order], np.float64) + 0.5
+    keypoints = np.array([points[i].pt for i in order], np.float64) + 0.5
     root = np.sqrt(descriptors[order] / descriptors[order].sum(1, keepdims=True).clip(1e-6))
-    column, row = places.astype(int).clip(0, np.array(size) - 1).T
+    column, row = keypoints.astype(int).clip(0, np.array(size) - 1).T
     colour = cv2.GaussianBlur(colours, (0, 0), 2.0)[row, column] / 255
     together = torch.from_numpy(np.hstack([root, colour])).float()
-    return Features(places * [width / size[0], height / size[1]], together)
+    return Features(keypoints * [width / size[0], height / size[1]], together)
 
 
 def match_features(first: Features, second: Features) -> Float[np.ndarray, "M 2 2"]:
     """Places of features that are each other's nearest, and clearly so."""
-    if min(len(first.places), len(second.places)) < 2:
+    if min(len(first.keypoints), len(second.keypoints)) < 2:
         return np.zeros((0, 2, 2))
     distance = torch.cdist(first.descriptors, second.descriptors)
     best, partner = distance.topk(2, dim=1, largest=False)
     index = torch.arange(len(distance))
     kept = (best[:, 0] < MAX_RATIO * best[:, 1]) & (distance.argmin(0)[partner[:, 0]] == index)
-    return np.stack([first.places[index[kept].numpy()], second.places[partner[kept, 0].numpy()]], axis=1)
+    return np.stack([first.keypoints[index[kept].numpy()], second.keypoints[partner[kept, 0].numpy()]], axis=1)
 
 
 def count_matches(features: Sequence[Features]) -> Int[np.ndarray, "V V"]:
     """How many of the strongest features of each photo have a match in each other one, and in reverse, whichever is less."""
-    table = torch.full((len(features), MAX_COARSE_FEATURES, DESCRIPTOR), 1e3)  # far from all, where there are fewer
+    table = torch.full((len(features), MAX_COARSE_FEATURES, FEATURE_DIM), 1e3)  # far from all, where there are fewer
     coarse = [one.descriptors[:MAX_COARSE_FEATURES] for one in features]
     for row, some in zip(table, coarse, strict=True):
         row[: len(some)] = some
@@ -124,12 +124,12 @@ def find_pairs(features: Sequence[Features], cameras: Cameras) -> list[Pair]:
     pairs = []
     for first, second in (every[i] for i in subsample(len(every), MAX_PAIRS)):
         pair = Pair(first, second, match_features(features[first], features[second]))
-        if len(pair.places) >= MIN_MATCHES and pair.displacement >= MIN_DISPLACEMENT * max(cameras.size(first)):
+        if len(pair.keypoints) >= MIN_MATCHES and pair.displacement >= MIN_DISPLACEMENT * max(cameras.size(first)):
             pairs.append(pair)
     return pairs
 
 
-def share_consistent(pairs: Sequence[Pair], longest: int) -> float:
+def compute_ransac_inlier_ratio(pairs: Sequence[Pair], longest: int) -> float:
     """Share of the matches that agree on a fundamental matrix of their pair, whatever the cameras.
 
     Args:
@@ -138,7 +138,7 @@ def share_consistent(pairs: Sequence[Pair], longest: int) -> float:
     """
     agree: list[Bool[np.ndarray, "M"]] = []
     for pair in pairs:
-        one, other = (pair.places / longest).transpose(1, 0, 2)  # one unit for all sizes
+        one, other = (pair.keypoints / longest).transpose(1, 0, 2)  # one unit for all sizes
         _, inliers = cv2.findFundamentalMat(one, other, cv2.FM_RANSAC, EPIPOLAR_TOLERANCE, 0.99, MAX_ITERATIONS)
         agree.append(np.zeros(len(one), bool) if inliers is None else inliers[:, 0] > 0)
     return float(np.concatenate(agree).mean())

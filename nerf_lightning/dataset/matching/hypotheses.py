@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
-from nerf_lightning.dataset.formats.names import natural_key
+from nerf_lightning.dataset.formats.file_names import make_natural_key
 
 Rotations = Float[np.ndarray, "V 3 3"]
 Poses = Float[np.ndarray, "V 4 4"]
 
-FLIP = np.diag([1.0, -1.0, -1.0])
+OPENGL_FLIP = np.diag([1.0, -1.0, -1.0])
 """Camera axes of OpenGL in OpenCV's, and the reverse."""
 
 
@@ -21,13 +21,13 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 class Hypothesis:
     """Cameras that a file may mean, and what is wrong with it if it does."""
 
-    found: str
-    todo: str
+    fault: str
+    hint: str
     c2w: Poses
     """OpenCV; in no particular world frame, as only relative poses count. Mirrored cameras have det R = -1."""
     zoom: float = 1.0
     """Focal length, in those given."""
-    rare: bool = False
+    is_rare: bool = False
     """Whether hardly anybody errs so: it must explain clearly more than the others."""
 
 
@@ -40,47 +40,47 @@ def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
     rotation, centre = c2w[:, :3, :3], c2w[:, :3, 3:]
     transposed = rotation.transpose(0, 2, 1)
     of_inverse = -transposed @ centre
-    flips, changes = (np.eye(3), FLIP), list_axis_changes()[1:]
+    flips, changes = (np.eye(3), OPENGL_FLIP), list_axis_changes()[1:]
 
     def suppose(
-        found: str, todo: str, rotation: Rotations, centre: Float[np.ndarray, "V 3 1"], rare: bool = False
+        fault: str, hint: str, rotation: Rotations, centre: Float[np.ndarray, "V 3 1"], is_rare: bool = False
     ) -> Hypothesis:
         moved = c2w.copy()
         moved[:, :3] = np.concatenate([rotation, centre], axis=2)
-        return Hypothesis(found, todo, moved, rare=rare)
+        return Hypothesis(fault, hint, moved, is_rare=is_rare)
 
     axes = "camera axes of the other convention: OpenCV has y down and z forward, OpenGL y up and z backward"
-    yield suppose(axes, "negate the second and third column of each rotation", rotation @ FLIP, centre)
+    yield suppose(axes, "negate the second and third column of each rotation", rotation @ OPENGL_FLIP, centre)
     inverse = "world-to-camera matrices, where camera-to-world ones belong"
     for flip in flips:
         yield suppose(inverse, "invert each matrix", transposed @ flip, of_inverse)
     for left, right in product(flips, repeat=2):
-        found = "transposed rotations beside the cameras' centres"
-        yield suppose(found, "transpose each rotation", left @ transposed @ right, centre)
+        fault = "transposed rotations beside the cameras' centres"
+        yield suppose(fault, "transpose each rotation", left @ transposed @ right, centre)
     for flip in flips:
-        found = "camera-to-world rotations beside translations of world-to-camera matrices"
-        todo = "put the cameras' centres -R t in the fourth column"
-        yield suppose(found, todo, rotation, -rotation @ flip @ centre)
+        fault = "camera-to-world rotations beside translations of world-to-camera matrices"
+        hint = "put the cameras' centres -R t in the fourth column"
+        yield suppose(fault, hint, rotation, -rotation @ flip @ centre)
     for change in changes:
         if np.linalg.det(change) < 0:
-            found = "a mirrored world: left-handed axes, or photos that are flipped"
-            todo = "negate one axis, of the world and of the cameras, or flip the photos back"
+            fault = "a mirrored world: left-handed axes, or photos that are flipped"
+            hint = "negate one axis, of the world and of the cameras, or flip the photos back"
         elif change[2, 2] == 1:
-            found = "photos that lie on their sides or upside down in their cameras"
-            todo = "turn them, as dataset.orientation=exif does where their EXIF data say so"
+            fault = "photos that lie on their sides or upside down in their cameras"
+            hint = "turn them, as dataset.orientation=exif does where their EXIF data say so"
         else:
-            found, todo = "camera axes in another order", "the columns of a rotation are the camera's axes in the world"
-        yield suppose(found, todo, rotation @ change, centre, rare=bool(change[2, 2] != 1))
-        yield suppose(f"{inverse}, of other axes", "invert each matrix", transposed @ change, of_inverse, rare=True)
-    found, todo = "rotations of quaternions in another order", "the order is w, x, y, z"
+            fault, hint = "camera axes in another order", "the columns of a rotation are the camera's axes in the world"
+        yield suppose(fault, hint, rotation @ change, centre, is_rare=bool(change[2, 2] != 1))
+        yield suppose(f"{inverse}, of other axes", "invert each matrix", transposed @ change, of_inverse, is_rare=True)
+    fault, hint = "rotations of quaternions in another order", "the order is w, x, y, z"
     for backward in (False, True):
         for flip in flips:
-            yield suppose(found, todo, roll_quaternions(rotation @ flip, backward) @ flip, centre)
+            yield suppose(fault, hint, roll_quaternions(rotation @ flip, backward) @ flip, centre)
         turned = roll_quaternions(transposed, backward).transpose(0, 2, 1)
-        yield suppose(found, todo, turned, -turned @ of_inverse)  # world-to-camera poses keep their translations
+        yield suppose(fault, hint, turned, -turned @ of_inverse)  # world-to-camera poses keep their translations
     for flip, change in product(flips, changes):
-        found, todo = "centres in another world frame than rotations", "turn both alike"
-        yield suppose(found, todo, rotation @ flip, change @ centre, rare=True)
+        fault, hint = "centres in another world frame than rotations", "turn both alike"
+        yield suppose(fault, hint, rotation @ flip, change @ centre, is_rare=True)
 
 
 def list_axis_changes() -> list[Float[np.ndarray, "3 3"]]:
@@ -99,7 +99,7 @@ def roll_quaternions(rotation: Rotations, backward: bool) -> Rotations:
     return Rotation.from_quat(np.roll(stored, 2 * backward - 1, axis=1)).as_matrix()
 
 
-def list_orders(names: Sequence[str], c2w: Poses, kept: Int[np.ndarray, "K"]) -> Iterator[Hypothesis]:
+def list_orders(names: Sequence[str], c2w: Poses, indices: Int[np.ndarray, "K"]) -> Iterator[Hypothesis]:
     """Poses in another order than the photos.
 
     Args:
@@ -109,20 +109,20 @@ def list_orders(names: Sequence[str], c2w: Poses, kept: Int[np.ndarray, "K"]) ->
     """
     every = range(len(names))
     alphabetical = np.array(sorted(every, key=lambda i: names[i]))
-    numeric = np.array(sorted(every, key=lambda i: natural_key(names[i])))
+    numeric = np.array(sorted(every, key=lambda i: make_natural_key(names[i])))
 
-    def suppose(found: str, source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Hypothesis:
+    def suppose(fault: str, source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Hypothesis:
         moved = c2w.copy()
         moved[target] = c2w[source]
-        return Hypothesis(found, "give each photo its own pose", moved[kept])
+        return Hypothesis(fault, "give each photo its own pose", moved[indices])
 
     for order in (alphabetical, numeric):
         for step, where in ((1, "before"), (-1, "after")):
             # Read: each photo has the pose of the one before it; so its own is at the next.
-            found = f"poses that are those of the photos {where} them in the order of names"
-            yield suppose(found, np.roll(order, -step), order)
+            fault = f"poses that are those of the photos {where} them in the order of names"
+            yield suppose(fault, np.roll(order, -step), order)
         yield suppose("poses in the reverse order of the photos", order[::-1], order)
-    found = "poses in another order than the photos, whose names sort otherwise as numbers (2, 10) than as text (10, 2)"
+    fault = "poses in another order than the photos, whose names sort otherwise as numbers (2, 10) than as text (10, 2)"
     if (alphabetical != numeric).any():
-        yield suppose(found, alphabetical, numeric)
-        yield suppose(found, numeric, alphabetical)
+        yield suppose(fault, alphabetical, numeric)
+        yield suppose(fault, numeric, alphabetical)

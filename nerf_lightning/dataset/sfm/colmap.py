@@ -13,10 +13,16 @@ from jaxtyping import Float
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from nerf_lightning.dataset.formats.decode import DAMAGED, DETAILS, THREADS, read_header, read_pixels
+from nerf_lightning.dataset.formats.image_files import (
+    DECODE_ERRORS,
+    EXIF_IFD_TAG,
+    MAX_DECODE_THREADS,
+    read_header,
+    read_pixels,
+)
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.resize import fit_size
-from nerf_lightning.utils.progress import counted, tracked
+from nerf_lightning.utils.progress import progress_bar, track_progress
 
 if TYPE_CHECKING:
     import pycolmap
@@ -25,21 +31,21 @@ log = logging.getLogger(__name__)
 
 MIN_PHOTOS = 3
 """Of which a scene can be made."""
-COPY_SIDE = 1600
+COPY_SIDE_PX = 1600
 """Longest side in pixels of the copies in which COLMAP looks for features."""
 MIN_OPENCV_PHOTOS = 6
 """Photos of a lens from which the lens model OPENCV is found; fewer photos get a simpler one."""
-MAX_EXHAUSTIVE = 150
+MAX_EXHAUSTIVE_PHOTOS = 150
 """Photos up to which each is compared with each; beyond, with those near it in order."""
-NEIGHBOURS, LANDMARKS = 20, 60
+SEQUENTIAL_WINDOW, NUM_LOOP_PHOTOS = 20, 60
 """In order, on either side; and photos, evenly chosen, that are compared with each other too, so that a round closes."""
 PAIRS_PER_CALL = 300
 """Pairs that are matched in one call: few enough that the bar moves."""
 MAX_ERROR_FRACTION = 0.004
 """Reprojection distance up to which a match with photos of known pose holds, in longest sides: 4 pixels at 1000."""
-MIN_POINTS = 15
+MIN_POSE_POINTS = 15
 """That must agree on a pose: five times as many as determine one, so that chance matches do not."""
-MAKE, MODEL, FOCAL, FOCAL_35MM = 0x010F, 0x0110, 0x920A, 0xA405
+MAKE_TAG, MODEL_TAG, FOCAL_TAG, FOCAL_35MM_TAG = 0x010F, 0x0110, 0x920A, 0xA405
 """Numbers of the EXIF tags from which COLMAP takes the focal length, in millimetres."""
 
 
@@ -61,7 +67,7 @@ def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruc
     database, copies, sizes = match_photos(photos, workspace)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_PHOTOS, random_seed=0)
     (workspace / "models").mkdir()
-    with counted(len(photos), "placing photos") as step:
+    with progress_bar(len(photos), "placing photos") as step:
         callbacks: dict[str, Any] = {
             "initial_image_pair_callback": lambda: step(2),
             "next_image_callback": lambda: step(1),
@@ -69,11 +75,11 @@ def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruc
         models = pycolmap.incremental_mapping(database, copies, workspace / "models", options, **callbacks)
     model = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
     if model is not None:
-        _make_full_size(model, photos, sizes)
+        _rescale_model(model, photos, sizes)
     return model
 
 
-def register(
+def register_with_known_poses(
     photos: Sequence[Path], lens: Intrinsics, known: Mapping[int, Float[np.ndarray, "4 4"]], workspace: Path
 ) -> dict[int, tuple[Float[np.ndarray, "4 4"], float]]:
     """Places photos against those whose poses are known, which stay as they are, and so do the lens, the scale and the frame.
@@ -90,19 +96,19 @@ def register(
     """
     import pycolmap
 
-    parameters = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.opencv, 0.0, 0.0, 0.0]
+    parameters = [lens.fx, lens.fy, lens.cx, lens.cy, *lens.opencv_distortion, 0.0, 0.0, 0.0]
     camera = pycolmap.Camera(model="FULL_OPENCV", width=lens.width, height=lens.height, params=parameters)
     camera.has_prior_focal_length = True
-    camera.rescale(*fit_size(lens.width, lens.height, COPY_SIDE))
+    camera.rescale(*fit_size(lens.width, lens.height, COPY_SIDE_PX))
     database, copies, _ = match_photos(photos, workspace, camera)
     start = pycolmap.Reconstruction()
     with pycolmap.Database.open(database) as content:
         (camera,), images = content.read_all_cameras(), content.read_all_images()
     start.add_camera_with_trivial_rig(camera)
     for image in images:
-        if number_of(image) in known:
+        if parse_index(image) in known:
             placed = pycolmap.Image(name=image.name, camera_id=camera.camera_id, image_id=image.image_id)
-            start.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(known[number_of(image)][:3]))
+            start.add_image_with_trivial_frame(placed, pycolmap.Rigid3d(known[parse_index(image)][:3]))
     folder, output = workspace / "known", workspace / "models"
     folder.mkdir()
     output.mkdir()
@@ -111,10 +117,13 @@ def register(
     models = pycolmap.incremental_mapping(database, copies, output, options, input_path=folder)
     scale = lens.width / camera.width
     return {
-        number_of(image): (np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]), scale * _rms(image, model))
+        parse_index(image): (
+            np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]),
+            scale * _compute_rms_error(image, model),
+        )
         for model in models.values()
         for image in model.images.values()
-        if image.has_pose and number_of(image) not in known and image.num_points3D >= MIN_POINTS
+        if image.has_pose and parse_index(image) not in known and image.num_points3D >= MIN_POSE_POINTS
     }
 
 
@@ -144,11 +153,11 @@ def match_photos(
         with pycolmap.Database.open(database) as content:
             reader.existing_camera_id = content.write_camera(camera)
     copies.mkdir()
-    with ThreadPoolExecutor(THREADS) as pool:
-        written = pool.map(_write_copy, photos, [copies / copy_name(number) for number in range(len(photos))])
-        lenses = list(tracked(written, len(photos), "reading photos"))
+    with ThreadPoolExecutor(MAX_DECODE_THREADS) as pool:
+        written = pool.map(_write_copy, photos, [copies / make_copy_name(number) for number in range(len(photos))])
+        lenses = list(track_progress(written, len(photos), "reading photos"))
     for lens in dict.fromkeys(lenses):
-        names = [copy_name(number) for number, other in enumerate(lenses) if other == lens]
+        names = [make_copy_name(number) for number, other in enumerate(lenses) if other == lens]
         log.info("looking for features in %d photos of %dx%d", len(names), *lens[0])
         reader.camera_model = "OPENCV" if len(names) >= MIN_OPENCV_PHOTOS else "SIMPLE_RADIAL"
         pycolmap.extract_features(database, copies, names, pycolmap.CameraMode.SINGLE, reader)
@@ -157,10 +166,10 @@ def match_photos(
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     log.info("matching %d pairs", len(pairs))
-    with counted(len(pairs), "matching pairs of photos") as step:
+    with progress_bar(len(pairs), "matching pairs of photos") as step:
         for first in range(0, len(pairs), PAIRS_PER_CALL):
             chunk = pairs[first : first + PAIRS_PER_CALL]
-            lines = [f"{copy_name(i)} {copy_name(j)}\n" for i, j in chunk]
+            lines = [f"{make_copy_name(i)} {make_copy_name(j)}\n" for i, j in chunk]
             (workspace / "pairs.txt").write_text("".join(lines), encoding="utf-8")
             pycolmap.match_image_pairs(database, pairing_options=options, verification_options=verification)
             step(len(chunk))
@@ -169,19 +178,19 @@ def match_photos(
 
 def pair_photos(count: int) -> list[tuple[int, int]]:
     """Which photos are compared: all with all, or of many those near each other in order, and a few with each other."""
-    if count <= MAX_EXHAUSTIVE:
+    if count <= MAX_EXHAUSTIVE_PHOTOS:
         return list(itertools.combinations(range(count), 2))
-    near = {(i, j) for i in range(count) for j in range(i + 1, min(i + NEIGHBOURS + 1, count))}
-    landmarks = np.linspace(0, count - 1, LANDMARKS).round().astype(int).tolist()
+    near = {(i, j) for i in range(count) for j in range(i + 1, min(i + SEQUENTIAL_WINDOW + 1, count))}
+    landmarks = np.linspace(0, count - 1, NUM_LOOP_PHOTOS).round().astype(int).tolist()
     return sorted(near | set(itertools.combinations(landmarks, 2)))
 
 
-def copy_name(number: int) -> str:
+def make_copy_name(number: int) -> str:
     """The name of a photo's copy: COLMAP cannot read every name."""
     return f"{number:06d}.jpg"
 
 
-def number_of(image: "pycolmap.Image") -> int:
+def parse_index(image: "pycolmap.Image") -> int:
     """The number of the photo of a copy."""
     return int(Path(image.name).stem)
 
@@ -190,23 +199,25 @@ def _write_copy(photo: Path, file: Path) -> tuple[tuple[int, int], bytes]:
     """Writes a small upright copy in a format that COLMAP reads; the full size and the EXIF tags, which photos of one lens
     share."""
     image = Image.fromarray(np.ascontiguousarray(read_pixels(photo, upright=True)[..., :3]))
-    tags = lens_tags(photo)
-    small = image.resize(fit_size(*image.size, COPY_SIDE), Image.Resampling.BOX)
+    tags = read_lens_tags(photo)
+    small = image.resize(fit_size(*image.size, COPY_SIDE_PX), Image.Resampling.BOX)
     small.save(file, quality=98, subsampling=0, exif=tags)
     return image.size, tags
 
 
-def lens_tags(photo: Path) -> bytes:
+def read_lens_tags(photo: Path) -> bytes:
     """The EXIF tags of a photo that tell of its lens; where they are broken, or there are none, nothing is known."""
     tags, kept = read_header(photo).tags, Image.Exif()
     try:
-        kept.update({tag: str(tags[tag]) for tag in (MAKE, MODEL) if tag in tags})
-        if float(tags.get(FOCAL, 0)) > 0:
-            kept.get_ifd(DETAILS)[FOCAL] = IFDRational(Fraction(float(tags[FOCAL])).limit_denominator(1000))
-        if float(tags.get(FOCAL_35MM, 0)) > 0:
-            kept.get_ifd(DETAILS)[FOCAL_35MM] = round(float(tags[FOCAL_35MM]))
+        kept.update({tag: str(tags[tag]) for tag in (MAKE_TAG, MODEL_TAG) if tag in tags})
+        if float(tags.get(FOCAL_TAG, 0)) > 0:
+            kept.get_ifd(EXIF_IFD_TAG)[FOCAL_TAG] = IFDRational(
+                Fraction(float(tags[FOCAL_TAG])).limit_denominator(1000)
+            )
+        if float(tags.get(FOCAL_35MM_TAG, 0)) > 0:
+            kept.get_ifd(EXIF_IFD_TAG)[FOCAL_35MM_TAG] = round(float(tags[FOCAL_35MM_TAG]))
         return kept.tobytes()
-    except DAMAGED:
+    except DECODE_ERRORS:
         return b""
 
 
@@ -217,18 +228,18 @@ def _fixed_pose_options(max_error: float) -> "pycolmap.IncrementalPipelineOption
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, multiple_models=False, fix_existing_frames=True)
     options.ba_refine_focal_length = options.ba_refine_principal_point = options.ba_refine_extra_params = False
     options.mapper.abs_pose_refine_focal_length = options.mapper.abs_pose_refine_extra_params = False
-    options.mapper.abs_pose_min_num_inliers = MIN_POINTS
+    options.mapper.abs_pose_min_num_inliers = MIN_POSE_POINTS
     options.mapper.abs_pose_max_error = options.mapper.filter_max_reproj_error = max_error
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
     options.triangulation.ignore_two_view_tracks = False  # poses are known: two views tell where a point is
     return options
 
 
-def _make_full_size(model: "pycolmap.Reconstruction", photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> None:
+def _rescale_model(model: "pycolmap.Reconstruction", photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> None:
     """Changes a model of copies into one of the photos; COLMAP's pixel centres are at +0.5, as ours are."""
     scales = {}
     for image in model.images.values():
-        number, camera = number_of(image), model.cameras[image.camera_id]
+        number, camera = parse_index(image), model.cameras[image.camera_id]
         if image.camera_id not in scales:
             scales[image.camera_id] = np.divide(sizes[number], [camera.width, camera.height])
             camera.rescale(*sizes[number])
@@ -238,7 +249,7 @@ def _make_full_size(model: "pycolmap.Reconstruction", photos: Sequence[Path], si
     model.update_point_3d_errors()
 
 
-def _rms(image: "pycolmap.Image", model: "pycolmap.Reconstruction") -> float:
+def _compute_rms_error(image: "pycolmap.Image", model: "pycolmap.Reconstruction") -> float:
     """Root mean square reprojection error over a photo's points, pixels."""
     points = [point for point in image.points2D if point.has_point3D()]
     projected = [image.project_point(model.points3D[point.point3D_id].xyz) for point in points]

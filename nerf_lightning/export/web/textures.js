@@ -89,7 +89,7 @@ function planesOf(gl, compact, about) {
 }
 
 function voxelsOf(gl, compact, about) {
-  const kept = compact.bits("field.kept"), side = Math.round(Math.cbrt(kept.length)), terms = about.terms;
+  const kept = compact.bits("field.occupied"), side = Math.round(Math.cbrt(kept.length)), terms = about.terms;
   const rowOf = new Uint32Array(kept.length), bricks = Math.max(1, Math.ceil((side - 1) / BRICK)), used = [];
   for (let i = 0, row = 0; i < kept.length; i++) rowOf[i] = kept[i] ? ++row : 0;
   const vertex = (x, y, z) => x < side && y < side && z < side ? rowOf[(x * side + y) * side + z] : 0;
@@ -103,7 +103,7 @@ function voxelsOf(gl, compact, about) {
   const size = BRICK + 1, across = Math.max(1, Math.ceil(Math.cbrt(used.length * (1 + terms)))), deep = Math.max(1, Math.ceil(used.length / across ** 2));
   const shape = [across * size, across * size, deep * size * (1 + terms)];
   if (Math.max(...shape) > gl.getParameter(gl.MAX_3D_TEXTURE_SIZE)) throw new Error("This field is too large for this device's graphics.");
-  const tables = ["log_density", "colours", "views"].map(name => compact.stored("field." + name));
+  const tables = ["log_density", "colours", "sh_coefficients"].map(name => compact.stored("field." + name));
   const halves = tables.some(table => table.columns && table.data.length && !(table.data instanceof Uint8Array));
   if (halves) for (const table of tables) if (table.data instanceof Uint8Array) {
     const { low, span, columns } = table;
@@ -124,7 +124,7 @@ function voxelsOf(gl, compact, about) {
   const ranges = [density.low[0], ...colours.low, density.span[0], ...colours.span];
   for (let b = 0; b < terms; b++) for (const row of [views.low, views.span]) ranges.push(row[b], row[terms + b], row[2 * terms + b], 0);
   return {
-    constants: { SIDE: side, BRICKS: bricks, DENSITY_RATE: number(about.density_rate) },
+    constants: { SIDE: side, BRICKS: bricks, DENSITY_RATE: number(about.density_lr_scale) },
     textures: {
       bricks: makeTexture(gl, gl.TEXTURE_3D, "places", [bricks, bricks, bricks], places, false),
       atlas: makeTexture(gl, gl.TEXTURE_3D, halves ? "halves" : "bytes", shape, texels, true),

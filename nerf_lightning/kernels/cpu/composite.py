@@ -4,11 +4,11 @@ import math
 
 from numba import prange
 
-from nerf_lightning.kernels.cpu.compile import kernel
+from nerf_lightning.kernels.cpu.jit import kernel
 
 
 @kernel
-def forward(density, rgb, t, dt, offsets, colour, opacity, depth, before):
+def forward(density, rgb, t, dt, offsets, colour, opacity, depth, transmittance):
     """Fills the sums over each ray, colour [3, R], opacity [R], depth [R], and the transmittance before each sample [N]."""
     for ray in prange(len(offsets) - 1):
         optical = 0.0  # in double: the sum over a ray outgrows single precision
@@ -17,7 +17,7 @@ def forward(density, rgb, t, dt, offsets, colour, opacity, depth, before):
             through = math.exp(-optical)
             step = density[n] * dt[n]
             weight = through * -math.expm1(-step)
-            before[n] = through
+            transmittance[n] = through
             optical += step
             red += weight * rgb[0, n]
             green += weight * rgb[1, n]
@@ -29,27 +29,29 @@ def forward(density, rgb, t, dt, offsets, colour, opacity, depth, before):
 
 
 @kernel
-def backward(density, rgb, t, dt, offsets, before, colour_above, opacity_above, depth_above, grad_density, grad_rgb):
+def backward(
+    density, rgb, t, dt, offsets, transmittance, grad_colour, grad_opacity, grad_depth, grad_density, grad_rgb
+):
     """Gradients of density [N] and rgb [3, N] from those of colour [3, R], opacity [R] and depth [R].
 
     With g_i the gradient of weight w_i:  d/d density_i = dt_i (T_{i+1} g_i - sum_{j > i} w_j g_j), taken from the far end.
     """
     for ray in prange(len(offsets) - 1):
-        red, green, blue = colour_above[0, ray], colour_above[1, ray], colour_above[2, ray]
+        red, green, blue = grad_colour[0, ray], grad_colour[1, ray], grad_colour[2, ray]
         behind = 0.0
         for n in range(offsets[ray + 1] - 1, offsets[ray] - 1, -1):
             step = density[n] * dt[n]
-            after = before[n] * math.exp(-step)
-            weight = before[n] * -math.expm1(-step)
+            after = transmittance[n] * math.exp(-step)
+            weight = transmittance[n] * -math.expm1(-step)
             of_colour = red * rgb[0, n] + green * rgb[1, n] + blue * rgb[2, n]
-            grad_weight = of_colour + opacity_above[ray] + depth_above[ray] * t[n]
+            grad_weight = of_colour + grad_opacity[ray] + grad_depth[ray] * t[n]
             grad_density[n] = dt[n] * (after * grad_weight - behind)
             behind += weight * grad_weight
             grad_rgb[0, n], grad_rgb[1, n], grad_rgb[2, n] = weight * red, weight * green, weight * blue
 
 
 @kernel
-def visible(thickness, offsets, early_stop_eps, min_thickness, dropped, keep, counts):
+def mark_visible(optical_depth, offsets, early_stop_eps, min_optical_depth, max_dropped, keep, counts):
     """Marks samples that light can reach and that hold something, and counts them for each ray [R].
 
     Args:
@@ -61,29 +63,29 @@ def visible(thickness, offsets, early_stop_eps, min_thickness, dropped, keep, co
     for ray in prange(len(offsets) - 1):
         optical, thin, kept = 0.0, 0.0, 0
         for n in range(offsets[ray], offsets[ray + 1]):
-            step = thickness[n]
-            nothing = step < min_thickness  # NaN stays, to be noticed
+            step = optical_depth[n]
+            nothing = step < min_optical_depth  # NaN stays, to be noticed
             if nothing:
                 thin += step
-            keep[n] = not (optical > furthest or (nothing and thin <= dropped))
+            keep[n] = not (optical > furthest or (nothing and thin <= max_dropped))
             kept += keep[n]
             optical += step
         counts[ray] = kept
 
 
 @kernel
-def gather(keep, offsets, kept_offsets, thickness, t, dt, out, out_ray):
+def pack_visible(keep, offsets, kept_offsets, optical_depth, t, dt, out, out_ray):
     """Packs the kept samples: their thickness, t and dt into out [3, K]."""
     for ray in prange(len(offsets) - 1):
         to = kept_offsets[ray]
         for n in range(offsets[ray], offsets[ray + 1]):
             if keep[n]:
-                out[0, to], out[1, to], out[2, to], out_ray[to] = thickness[n], t[n], dt[n], ray
+                out[0, to], out[1, to], out[2, to], out_ray[to] = optical_depth[n], t[n], dt[n], ray
                 to += 1
 
 
 @kernel
-def absorb(thickness, offsets, which, furthest, most, optical, going):
+def accumulate_optical_depth(optical_depth, offsets, rays, furthest, max_intervals, optical, active):
     """Adds up in `optical` [R] what some rays have met, and says which of these go on [A].
 
     Args:
@@ -91,21 +93,21 @@ def absorb(thickness, offsets, which, furthest, most, optical, going):
         furthest: optical thickness behind which light does not reach.
         most: a ray with fewer new samples has no more.
     """
-    for n in prange(len(which)):
-        met = optical[which[n]]
+    for n in prange(len(rays)):
+        met = optical[rays[n]]
         for m in range(offsets[n], offsets[n + 1]):
-            met += thickness[m]
-        optical[which[n]] = met
-        going[n] = offsets[n + 1] - offsets[n] == most and not met > furthest
+            met += optical_depth[m]
+        optical[rays[n]] = met
+        active[n] = offsets[n + 1] - offsets[n] == max_intervals and not met > furthest
 
 
 @kernel
-def append(which, offsets, thickness, t, dt, at, out_thickness, out_t, out_dt, out_ray):
+def append_samples(rays, offsets, optical_depth, t, dt, at, out_optical_depth, out_t, out_dt, out_ray):
     """Writes some rays' [A] samples to where these rays' next ones belong, at [R], which moves on."""
-    for n in prange(len(which)):
-        ray = which[n]
+    for n in prange(len(rays)):
+        ray = rays[n]
         to = at[ray]
         for m in range(offsets[n], offsets[n + 1]):
-            out_thickness[to], out_t[to], out_dt[to], out_ray[to] = thickness[m], t[m], dt[m], ray
+            out_optical_depth[to], out_t[to], out_dt[to], out_ray[to] = optical_depth[m], t[m], dt[m], ray
             to += 1
         at[ray] = to

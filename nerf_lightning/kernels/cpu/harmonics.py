@@ -2,7 +2,7 @@
 
 from numba import float32, prange
 
-from nerf_lightning.kernels.cpu.compile import kernel
+from nerf_lightning.kernels.cpu.jit import kernel
 
 C0, C1 = float32(0.28209479177387814), float32(0.48860251190291987)
 C2A, C2B, C2C = float32(1.0925484305920792), float32(0.31539156525252005), float32(0.5462742152960396)

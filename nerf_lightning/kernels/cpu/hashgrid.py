@@ -6,12 +6,12 @@
 import numpy as np
 from numba import float32, int32, prange, uint32
 
-from nerf_lightning.kernels.cpu.compile import inner, kernel
+from nerf_lightning.kernels.cpu.jit import jit, kernel
 
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Instant-NGP, eq. 4
 
 
-@inner(inline="always")
+@jit(inline="always")
 def cell_of(x, resolution):
     """Lower corner and fraction of one coordinate in [0, 1]; clamped outside. NaN stays NaN, in some cell."""
     scaled = min(max(x, float32(0)), float32(1)) * float32(resolution)
@@ -19,8 +19,8 @@ def cell_of(x, resolution):
     return uint32(cell), scaled - float32(cell)
 
 
-@inner(inline="always")
-def square(x, y, side, dense):
+@jit(inline="always")
+def combine_corners_2d(x, y, side, dense):
     """What two coordinates contribute to the numbers of the four corners' entries, the second coordinate fastest."""
     if dense:
         first = x + y * side
@@ -30,7 +30,7 @@ def square(x, y, side, dense):
     return x ^ y0, x ^ y1, x1 ^ y0, x1 ^ y1
 
 
-@inner(forceinline=True)
+@jit(forceinline=True)
 def corners(unit, n, cells, entries, axes):
     """Entries and weights of the corners around place n, the last coordinate fastest; row-major where they fit, else hashed."""
     x, fx = cell_of(unit[0, n], cells[0])
@@ -40,7 +40,7 @@ def corners(unit, n, cells, entries, axes):
     wa, wb, wc, wd = gx * gy, gx * fy, fx * gy, fx * fy
     if len(axes) == 2:
         dense = corners_2d <= entries
-        a, b, c, d = square(x, y, side, dense)
+        a, b, c, d = combine_corners_2d(x, y, side, dense)
         if dense:
             return (a, b, c, d), (wa, wb, wc, wd)
         return (a & mask, b & mask, c & mask, d & mask), (wa, wb, wc, wd)
@@ -48,7 +48,7 @@ def corners(unit, n, cells, entries, axes):
     gz = float32(1) - fz
     weights = wa * gz, wa * fz, wb * gz, wb * fz, wc * gz, wc * fz, wd * gz, wd * fz
     dense = corners_2d * np.int64(cells[2] + 1) <= entries
-    a, b, c, d = square(x, y, side, dense)
+    a, b, c, d = combine_corners_2d(x, y, side, dense)
     if dense:
         z0 = z * uint32(corners_2d)
         z1 = z0 + uint32(corners_2d)
@@ -61,13 +61,13 @@ def corners(unit, n, cells, entries, axes):
     ), weights  # fmt: skip
 
 
-@inner(forceinline=True)
+@jit(forceinline=True)
 def cells_of(resolutions, level, axes):
     """A level's cells along each axis, as numbers that stay in registers."""
     return resolutions[level, 0], resolutions[level, 1], resolutions[level, len(axes) - 1]
 
 
-@inner
+@jit
 def interpolate_level(table, unit, first, last, cells, out, axes, features):
     """Fills out[:, first:last]."""
     for n in range(first, last):
@@ -75,39 +75,39 @@ def interpolate_level(table, unit, first, last, cells, out, axes, features):
         for f in range(len(features)):
             value = (w[0] * table[i[0], f] + w[1] * table[i[1], f]) + (w[2] * table[i[2], f] + w[3] * table[i[3], f])
             if len(axes) == 3:
-                above = w[4] * table[i[4], f] + w[5] * table[i[5], f]
-                value += above + (w[6] * table[i[6], f] + w[7] * table[i[7], f])
+                upper = w[4] * table[i[4], f] + w[5] * table[i[5], f]
+                value += upper + (w[6] * table[i[6], f] + w[7] * table[i[7], f])
             out[f, n] = value
 
 
-@inner
-def scatter_level(grad, unit, cells, above, axes, features):
-    """Adds the gradient of one level's features, `above` [F, N], to the gradient of its table."""
+@jit
+def scatter_level(grad, unit, cells, grad_output, axes, features):
+    """Adds the gradient of one level's features, `grad_output` [F, N], to the gradient of its table."""
     for n in range(unit.shape[1]):
         i, w = corners(unit, n, cells, len(grad), axes)
         for f in range(len(features)):
-            g = above[f, n]
+            g = grad_output[f, n]
             for corner in range(len(w)):
                 grad[i[corner], f] += w[corner] * g
 
 
-@inner(inline="always")
-def pulled(table, row, above, n, features):
+@jit(inline="always")
+def dot_grad_output(table, row, grad_output, n, features):
     """How the loss changes with how much of an entry place n reads."""
     value = float32(0)
     for f in range(len(features)):
-        value += above[f, n] * table[row, f]
+        value += grad_output[f, n] * table[row, f]
     return value
 
 
-@inner(inline="always")
-def steepness(x, resolution):
+@jit(inline="always")
+def cells_per_unit(x, resolution):
     """How many cells a coordinate passes per unit: none where it is clamped."""
     return float32(resolution) if float32(0) <= x <= float32(1) else float32(0)
 
 
-@inner(inline="always")
-def trilinear_slope(v, fx, fy, fz):
+@jit(inline="always")
+def trilinear_gradient(v, fx, fy, fz):
     """How the mean of the values at a cell's corners changes along each axis, per cell."""
     gx, gy, gz = float32(1) - fx, float32(1) - fy, float32(1) - fz
     return (
@@ -117,26 +117,38 @@ def trilinear_slope(v, fx, fy, fz):
     )
 
 
-@inner
-def slope_level(table, unit, first, last, cells, above, grad, axes, features):
-    """Adds to grad[:, first:last] the gradient in the places that one level's features, `above` [F, N], give."""
+@jit
+def position_gradient_level(table, unit, first, last, cells, grad_output, grad, axes, features):
+    """Adds to grad[:, first:last] the gradient in the places that one level's features, `grad_output` [F, N], give."""
     for n in range(first, last):
         i, w = corners(unit, n, cells, len(table), axes)
         x, fx = cell_of(unit[0, n], cells[0])
         y, fy = cell_of(unit[1, n], cells[1])
-        a, b = pulled(table, i[0], above, n, features), pulled(table, i[1], above, n, features)
-        c, d = pulled(table, i[2], above, n, features), pulled(table, i[3], above, n, features)
+        a, b = (
+            dot_grad_output(table, i[0], grad_output, n, features),
+            dot_grad_output(table, i[1], grad_output, n, features),
+        )
+        c, d = (
+            dot_grad_output(table, i[2], grad_output, n, features),
+            dot_grad_output(table, i[3], grad_output, n, features),
+        )
         if len(axes) == 2:
             gx, gy = float32(1) - fx, float32(1) - fy
             dx, dy = gy * (c - a) + fy * (d - b), gx * (b - a) + fx * (d - c)
         else:
-            e, f = pulled(table, i[4], above, n, features), pulled(table, i[5], above, n, features)
-            g, h = pulled(table, i[6], above, n, features), pulled(table, i[7], above, n, features)
+            e, f = (
+                dot_grad_output(table, i[4], grad_output, n, features),
+                dot_grad_output(table, i[5], grad_output, n, features),
+            )
+            g, h = (
+                dot_grad_output(table, i[6], grad_output, n, features),
+                dot_grad_output(table, i[7], grad_output, n, features),
+            )
             z, fz = cell_of(unit[2, n], cells[2])
-            dx, dy, dz = trilinear_slope((a, b, c, d, e, f, g, h), fx, fy, fz)
-            grad[2, n] += steepness(unit[2, n], cells[2]) * dz
-        grad[0, n] += steepness(unit[0, n], cells[0]) * dx
-        grad[1, n] += steepness(unit[1, n], cells[1]) * dy
+            dx, dy, dz = trilinear_gradient((a, b, c, d, e, f, g, h), fx, fy, fz)
+            grad[2, n] += cells_per_unit(unit[2, n], cells[2]) * dz
+        grad[0, n] += cells_per_unit(unit[0, n], cells[0]) * dx
+        grad[1, n] += cells_per_unit(unit[1, n], cells[1]) * dy
 
 
 @kernel
@@ -161,7 +173,7 @@ def interpolate(tables, unit, resolutions, sizes, out, axes, features, workers):
 
 
 @kernel
-def scatter(grad, unit, resolutions, sizes, above, axes, features, workers):
+def scatter(grad, unit, resolutions, sizes, grad_output, axes, features, workers):
     """Fills grad [T, F]. A level belongs to one worker, so no two add to the same entry."""
     levels, width = len(resolutions), len(features)
     for worker in prange(workers):
@@ -170,12 +182,12 @@ def scatter(grad, unit, resolutions, sizes, above, axes, features, workers):
             if level % workers == worker:
                 part, cells = grad[start : start + sizes[level]], cells_of(resolutions, level, axes)
                 part[:] = float32(0)
-                scatter_level(part, unit, cells, above[level * width : (level + 1) * width], axes, features)
+                scatter_level(part, unit, cells, grad_output[level * width : (level + 1) * width], axes, features)
             start += sizes[level]
 
 
 @kernel
-def slope(tables, unit, resolutions, sizes, above, grad, axes, features, workers):
+def position_gradient(tables, unit, resolutions, sizes, grad_output, grad, axes, features, workers):
     """Fills grad [D, N], the gradient in the places."""
     samples, width = unit.shape[1], len(features)
     for worker in prange(workers):
@@ -183,6 +195,6 @@ def slope(tables, unit, resolutions, sizes, above, grad, axes, features, workers
         grad[:, first:last] = float32(0)
         for level in range(len(resolutions)):
             table, cells = tables[start : start + sizes[level]], cells_of(resolutions, level, axes)
-            rows = above[level * width : (level + 1) * width]
-            slope_level(table, unit, first, last, cells, rows, grad, axes, features)
+            rows = grad_output[level * width : (level + 1) * width]
+            position_gradient_level(table, unit, first, last, cells, rows, grad, axes, features)
             start += sizes[level]

@@ -7,43 +7,43 @@ are single: a double among them would make doubles of all.
 import numpy as np
 from numba import prange
 
-from nerf_lightning.kernels.cpu.compile import inner, kernel
+from nerf_lightning.kernels.cpu.jit import jit, kernel
 
 single = np.float32
 ZERO, HALF, ONE, TWO, TINY, INF = (single(number) for number in (0, 0.5, 1, 2, 1e-6, np.inf))
 CHEQUER, STRIPES, BRICKWORK = 1, 2, 3
-LIGHT = (single(4.5), single(5.0), single(10.0))
+LIGHT_POSITION = (single(4.5), single(5.0), single(10.0))
 """Position of the key light, world frame; no fall-off with distance."""
-FILL = tuple(single(part) / single(np.sqrt(0.985)) for part in (-0.65, -0.60, 0.45))
+FILL_DIRECTION = tuple(single(part) / single(np.sqrt(0.985)) for part in (-0.65, -0.60, 0.45))
 """Unit direction towards the fill light, which casts no shadow."""
 SKY, FLOOR = np.array([0.30, 0.32, 0.36], np.float32), np.array([0.13, 0.12, 0.10], np.float32)
-KEY_SHARE, FILL_SHARE, JOINT = single(0.80), single(0.32), single(0.09)
+KEY_LIGHT_WEIGHT, FILL_LIGHT_WEIGHT, JOINT = single(0.80), single(0.32), single(0.09)
 SHADOW_BIAS = single(0.01)
 """World units a surface may lie behind the shadow map: more than the slope of a texel, less than a stud."""
 
 
-@inner
+@jit
 def dot(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@inner
+@jit
 def subtract(a, b):
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
-@inner
+@jit
 def transform(m, v):
     return dot(m[0], v), dot(m[1], v), dot(m[2], v)
 
 
-@inner
+@jit
 def normalize(v):
     length = np.sqrt(dot(v, v))
     return v[0] / length, v[1] / length, v[2] / length
 
 
-@inner
+@jit
 def cross_slab(o, d):
     """Distances at which a ray crosses -1 and 1 along one axis, the nearer first."""
     inverse = ONE / d
@@ -51,8 +51,8 @@ def cross_slab(o, d):
     return np.minimum(low, high), np.maximum(low, high)
 
 
-@inner
-def enter(cylinder, o, d):
+@jit
+def entry_distance(cylinder, o, d):
     """The t at which a ray o + t * d enters the unit cube or cylinder (axis z), from outside; inf where it does not."""
     # A ray along a face divides by zero: infinities do the right thing, and the nan of one inside a face compares false.
     near, far = cross_slab(o[2], d[2])
@@ -92,12 +92,12 @@ def rasterize(cylinder, lift, eye, first, last, solid, depth, workers):
                 x, y, z = m[0, 1] * v + m[0, 2], m[1, 1] * v + m[1, 2], m[2, 1] * v + m[2, 2]
                 for col in range(first[k, 0], last[k, 0]):
                     u = single(col) + HALF
-                    t = enter(cylinder[k], o, (m[0, 0] * u + x, m[1, 0] * u + y, m[2, 0] * u + z))
+                    t = entry_distance(cylinder[k], o, (m[0, 0] * u + x, m[1, 0] * u + y, m[2, 0] * u + z))
                     if t < depth[row, col]:
                         solid[row, col], depth[row, col] = k, t
 
 
-@inner
+@jit
 def find_normal(cylinder, unit):
     """Outward normal at a point of the unit cube or cylinder, and the number of the axis whose face it is on (0: the curve)."""
     x, y, z = unit
@@ -109,7 +109,7 @@ def find_normal(cylinder, unit):
     return ((ZERO, np.sign(y), ZERO), 1) if abs(y) > radius else ((np.sign(x), ZERO, ZERO), 0)
 
 
-@inner
+@jit
 def has_accent(pattern, period, x, y, z, face):
     """Whether a pattern shows its second colour, given the place in the solid (from its lower corner) and the face."""
     # Along the face: u is horizontal on a side, v is vertical; x and y on a top.
@@ -126,10 +126,10 @@ def has_accent(pattern, period, x, y, z, face):
     return False
 
 
-@inner
+@jit
 def is_lit(shadow, solid, point):
     """Whether the key light reaches a point (world frame) on a solid, or on none of them (-1)."""
-    x, y, z = transform(shadow.rotation.T, subtract(point, LIGHT))
+    x, y, z = transform(shadow.rotation.T, subtract(point, LIGHT_POSITION))
     size, focal = len(shadow.depth), single(shadow.focal)
     col = int(min(max(focal * x / z + single(size / 2), ZERO), single(size - 1)))
     row = int(min(max(focal * y / z + single(size / 2), ZERO), single(size - 1)))
@@ -137,18 +137,18 @@ def is_lit(shadow, solid, point):
     return shadow.solid[row, col] == solid or z <= shadow.depth[row, col] + SHADOW_BIAS
 
 
-@inner
+@jit
 def add_colour(solids, shadow, k, point, direction, out):
     """Adds sRGB of a point on solid k, seen along a unit direction, to out [3]: Lambert, ambient and Blinn-Phong."""
-    place, half = transform(solids.axes[k], subtract(point, solids.centre[k])), solids.half[k]
-    own, face = find_normal(solids.cylinder[k], (place[0] / half[0], place[1] / half[1], place[2] / half[2]))
+    place, half = transform(solids.axes[k], subtract(point, solids.centre[k])), solids.half_size[k]
+    own, face = find_normal(solids.is_cylinder[k], (place[0] / half[0], place[1] / half[1], place[2] / half[2]))
     corner = (place[0] + half[0], place[1] + half[1], place[2] + half[2])
     accent = has_accent(solids.pattern[k], solids.period[k], corner[0], corner[1], corner[2], face)
     albedo = solids.accent[k] if accent else solids.colour[k]
     normal = transform(solids.axes[k].T, own)
-    light = normalize(subtract(LIGHT, point))
+    light = normalize(subtract(LIGHT_POSITION, point))
     key = max(dot(normal, light), ZERO) * single(is_lit(shadow, k, point))
-    fill = max(dot(normal, FILL), ZERO)
+    fill = max(dot(normal, FILL_DIRECTION), ZERO)
     highlight = max(dot(normal, normalize(subtract(light, direction))), ZERO)
     for _ in range(5):  # to the power 32
         highlight = highlight * highlight
@@ -157,7 +157,9 @@ def add_colour(solids, shadow, k, point, direction, out):
     for channel in range(3):
         ambient = FLOOR[channel] + (SKY[channel] - FLOOR[channel]) * up
         # A square root stands for the sRGB curve.
-        out[channel] += np.sqrt(min(albedo[channel] * (ambient + KEY_SHARE * key + FILL_SHARE * fill) + highlight, ONE))
+        out[channel] += np.sqrt(
+            min(albedo[channel] * (ambient + KEY_LIGHT_WEIGHT * key + FILL_LIGHT_WEIGHT * fill) + highlight, ONE)
+        )
 
 
 @kernel

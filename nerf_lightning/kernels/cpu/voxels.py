@@ -7,9 +7,9 @@ do not depend on the number of workers. Row 0, for all vertices that are not kep
 import numpy as np
 from numba import float32, int64, prange
 
-from nerf_lightning.kernels.cpu.compile import inner, kernel
-from nerf_lightning.kernels.cpu.hashgrid import cell_of, steepness, trilinear_slope
-from nerf_lightning.kernels.cpu.lanes import load, store, total, turn
+from nerf_lightning.kernels.cpu.hashgrid import cell_of, cells_per_unit, trilinear_gradient
+from nerf_lightning.kernels.cpu.jit import jit, kernel
+from nerf_lightning.kernels.cpu.simd import horizontal_sum, load, store, transpose_blocks
 
 TILE = 64
 """Samples whose basis functions are transposed together."""
@@ -19,7 +19,7 @@ BINS = 256
 """Pieces of the table in which a gradient's work is counted before it is divided among workers."""
 
 
-@inner
+@jit
 def corners(unit, n, index, cells):
     """Rows and weights of the eight vertices around sample n, the last coordinate fastest."""
     side = int64(cells + 1)
@@ -35,7 +35,7 @@ def corners(unit, n, index, cells):
 
 
 @kernel
-def locate(index, cells, unit, rows, weights):
+def locate_vertices(index, cells, unit, rows, weights):
     """Fills rows [N, 8] and weights [N, 8] for unit [3, N]."""
     for n in prange(unit.shape[1]):
         r, w = corners(unit, n, index, cells)
@@ -44,24 +44,24 @@ def locate(index, cells, unit, rows, weights):
 
 
 @kernel
-def slope(cells, unit, above, grad):
-    """Fills grad [3, N], the gradient in the places, from that in the weights, `above` [N, 8]."""
+def position_gradient(cells, unit, grad_output, grad):
+    """Fills grad [3, N], the gradient in the places, from that in the weights, `grad_output` [N, 8]."""
     for n in prange(unit.shape[1]):
         x, fx = cell_of(unit[0, n], cells)
         y, fy = cell_of(unit[1, n], cells)
         z, fz = cell_of(unit[2, n], cells)
-        dx, dy, dz = trilinear_slope(above[n], fx, fy, fz)
-        grad[0, n] = steepness(unit[0, n], cells) * dx
-        grad[1, n] = steepness(unit[1, n], cells) * dy
-        grad[2, n] = steepness(unit[2, n], cells) * dz
+        dx, dy, dz = trilinear_gradient(grad_output[n], fx, fy, fz)
+        grad[0, n] = cells_per_unit(unit[0, n], cells) * dx
+        grad[1, n] = cells_per_unit(unit[1, n], cells) * dy
+        grad[2, n] = cells_per_unit(unit[2, n], cells) * dz
 
 
 @kernel
-def mark(seen, rows, step):
+def mark_rows(last_read_step, rows, step):
     """seen [V] = step at all rows [N, 8]. Two workers may write to one row: the same value."""
     for n in prange(rows.shape[0]):
         for corner in range(8):
-            seen[rows[n, corner]] = step
+            last_read_step[rows[n, corner]] = step
 
 
 @kernel
@@ -89,7 +89,7 @@ def read(density, colour, rows, weights, raw, rgb):
 
 
 @kernel
-def pull(density, colour, rows, raw, rgb, grad):
+def weight_gradient(density, colour, rows, raw, rgb, grad):
     """Fills grad [N, 8], the gradient in the weights, from those of raw [N] and rgb [3, N]."""
     for n in prange(len(raw)):
         s, a, b, c = raw[n], rgb[0, n], rgb[1, n], rgb[2, n]
@@ -99,7 +99,7 @@ def pull(density, colour, rows, raw, rgb, grad):
 
 
 @kernel
-def add_views(views, rows, weights, basis, rgb, lanes, workers):
+def add_sh_colour(sh_coefficients, rows, weights, basis, rgb, lanes, workers):
     """Adds to rgb [3, N] the interpolated views [V, 3 B] times basis [B, N]; `lanes` is a tuple of length B."""
     samples, terms = rows.shape[0], len(lanes)
     for worker in prange(workers):
@@ -107,26 +107,26 @@ def add_views(views, rows, weights, basis, rgb, lanes, workers):
         tile = np.empty((TILE, terms), np.float32)
         for first in range(start, end, TILE):
             count = min(TILE, end - first)
-            turn(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
+            transpose_blocks(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
             for k in range(count):
                 n = first + k
                 row, weight = rows[n, 0], weights[n, 0]
-                a = weight * load(views, row, 0, lanes)
-                b = weight * load(views, row, terms, lanes)
-                c = weight * load(views, row, 2 * terms, lanes)
+                a = weight * load(sh_coefficients, row, 0, lanes)
+                b = weight * load(sh_coefficients, row, terms, lanes)
+                c = weight * load(sh_coefficients, row, 2 * terms, lanes)
                 for corner in range(1, 8):
                     row, weight = rows[n, corner], weights[n, corner]
-                    a = a + weight * load(views, row, 0, lanes)
-                    b = b + weight * load(views, row, terms, lanes)
-                    c = c + weight * load(views, row, 2 * terms, lanes)
+                    a = a + weight * load(sh_coefficients, row, 0, lanes)
+                    b = b + weight * load(sh_coefficients, row, terms, lanes)
+                    c = c + weight * load(sh_coefficients, row, 2 * terms, lanes)
                 given = load(tile, k, 0, lanes)
-                rgb[0, n] += total(a * given)
-                rgb[1, n] += total(b * given)
-                rgb[2, n] += total(c * given)
+                rgb[0, n] += horizontal_sum(a * given)
+                rgb[1, n] += horizontal_sum(b * given)
+                rgb[2, n] += horizontal_sum(c * given)
 
 
 @kernel
-def pull_views(views, rows, basis, rgb, grad, lanes, workers):
+def add_sh_weight_gradient(sh_coefficients, rows, basis, rgb, grad, lanes, workers):
     """Adds to grad [N, 8] what the views [V, 3 B] times basis [B, N] contribute to the gradient in the weights."""
     samples, terms = rows.shape[0], len(lanes)
     for worker in prange(workers):
@@ -134,18 +134,22 @@ def pull_views(views, rows, basis, rgb, grad, lanes, workers):
         tile = np.empty((TILE, terms), np.float32)
         for first in range(start, end, TILE):
             count = min(TILE, end - first)
-            turn(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
+            transpose_blocks(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
             for k in range(count):
                 n = first + k
                 given = load(tile, k, 0, lanes)
                 for corner in range(8):
                     row = rows[n, corner]
-                    mixed = rgb[0, n] * load(views, row, 0, lanes) + rgb[1, n] * load(views, row, terms, lanes)
-                    grad[n, corner] += total((mixed + rgb[2, n] * load(views, row, 2 * terms, lanes)) * given)
+                    mixed = rgb[0, n] * load(sh_coefficients, row, 0, lanes) + rgb[1, n] * load(
+                        sh_coefficients, row, terms, lanes
+                    )
+                    grad[n, corner] += horizontal_sum(
+                        (mixed + rgb[2, n] * load(sh_coefficients, row, 2 * terms, lanes)) * given
+                    )
 
 
-@inner
-def borders(rows, table, workers):
+@jit
+def balance_rows(rows, table, workers):
     """Rows [workers + 1], from 1 to `table`, that bound each worker's share, so that all have about as much to do."""
     counts, width = np.zeros(BINS, np.int64), table // BINS + 1
     for n in range(0, len(rows), 4):  # a sample of them is enough
@@ -166,7 +170,7 @@ def borders(rows, table, workers):
 @kernel
 def scatter(grad_density, grad_colour, rows, weights, raw, rgb, workers):
     """Adds to the gradients [V] and [V, 3] from those of raw [N] and rgb [3, N]."""
-    ends = borders(rows, len(grad_density), workers)
+    ends = balance_rows(rows, len(grad_density), workers)
     for worker in prange(workers):
         first, last = ends[worker], ends[worker + 1]
         for n in range(len(rows)):
@@ -180,13 +184,13 @@ def scatter(grad_density, grad_colour, rows, weights, raw, rgb, workers):
                     grad_colour[row, 2] += weight * c
 
 
-@inner
-def scatter_views_run(grad, rows, weights, basis, rgb, lanes, first, last):
+@jit
+def scatter_sh_rows(grad, rows, weights, basis, rgb, lanes, first, last):
     terms, samples = len(lanes), rows.shape[0]
     tile = np.empty((TILE, terms), np.float32)
     for begin in range(0, samples, TILE):
         count = min(TILE, samples - begin)
-        turn(basis, 0, begin, tile, 0, 0, terms, count, SQUARE)
+        transpose_blocks(basis, 0, begin, tile, 0, 0, terms, count, SQUARE)
         for k in range(count):
             n = begin + k
             given = load(tile, k, 0, lanes)
@@ -200,22 +204,22 @@ def scatter_views_run(grad, rows, weights, basis, rgb, lanes, first, last):
 
 
 @kernel
-def scatter_views(grad, rows, weights, basis, rgb, lanes, workers):
+def scatter_sh(grad, rows, weights, basis, rgb, lanes, workers):
     """Adds to the gradient [V, 3 B] from that of rgb [3, N]; a function of its own, as it is a third slower within the loop."""
-    ends = borders(rows, len(grad), workers)
+    ends = balance_rows(rows, len(grad), workers)
     for worker in prange(workers):
-        scatter_views_run(grad, rows, weights, basis, rgb, lanes, ends[worker], ends[worker + 1])
+        scatter_sh_rows(grad, rows, weights, basis, rgb, lanes, ends[worker], ends[worker + 1])
 
 
 @kernel
-def roughness(values, vertex, index, side, first, slope, sums, workers):
+def total_variation(values, vertex_of_row, index, side, first, slope, sums, workers):
     """For the rows from `first` on of values [V], as many as fit slope: the differences to all neighbours into slope, their
     squares into sums [workers]."""
     rows = len(slope)
     for worker in prange(workers):
         squares = 0.0
         for n in range(rows * worker // workers, rows * (worker + 1) // workers):
-            at, value, difference = int64(vertex[first + n]), values[first + n], float32(0)
+            at, value, difference = int64(vertex_of_row[first + n]), values[first + n], float32(0)
             place, stride = (at // (side * side), at // side % side, at % side), (side * side, side, 1)
             for axis in range(3):
                 for sign in (-1, 1):

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.kernels import spherical_harmonics
-from nerf_lightning.kernels.constants import constant
+from nerf_lightning.kernels.cached_constants import cache_constants
 
 
 def sinusoidal(x: Float[Tensor, "*batch D"], frequencies: int) -> Float[Tensor, "*batch E"]:
@@ -17,7 +17,7 @@ def sinusoidal(x: Float[Tensor, "*batch D"], frequencies: int) -> Float[Tensor, 
     return torch.cat([x, waves.flatten(-3)], dim=-1)
 
 
-@constant
+@cache_constants
 def _octaves(frequencies: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "L 1"]:
     return math.pi * 2.0 ** torch.arange(frequencies, device=device, dtype=dtype)[:, None]
 

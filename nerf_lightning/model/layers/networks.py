@@ -13,18 +13,18 @@ from torch import Tensor
 from torch.nn import Linear
 
 
-def layers(*widths: int) -> torch.nn.ModuleList:
+def build_layers(*widths: int) -> torch.nn.ModuleList:
     """Fully connected layers from each width to the next."""
     return torch.nn.ModuleList(Linear(i, o) for i, o in pairwise(widths))
 
 
-def linears(net: torch.nn.Module) -> list[Linear]:
+def linear_layers(net: torch.nn.Module) -> list[Linear]:
     """The fully connected layers of a network, in order."""
     return [layer for layer in net.modules() if isinstance(layer, Linear)]
 
 
-def weights(net: torch.nn.ModuleList) -> list[tuple[Tensor, Tensor]]:
-    """Matrix and bias of each of the `layers`."""
+def layer_parameters(net: torch.nn.ModuleList) -> list[tuple[Tensor, Tensor]]:
+    """Matrix and bias of each of `build_layers`."""
     return [(layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in net]
 
 
@@ -44,7 +44,7 @@ def widen(wide: Iterable[Linear], narrow: Iterable[Linear], columns: Int[Tensor,
         columns = None
 
 
-def as_wide(wide: torch.nn.Module, narrow: torch.nn.Module) -> bool:
+def is_at_least_as_wide(wide: torch.nn.Module, narrow: torch.nn.Module) -> bool:
     """Whether no linear layer of a field is narrower than that of the same name in another."""
     mine = dict(wide.named_modules())
     both = ((mine.get(name), its) for name, its in narrow.named_modules())

@@ -1,0 +1,214 @@
+"""The kernels' work in one training step: what they are called with, and which of that gets a gradient."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning import kernels
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.model import HashGrid, HashGrid2DField, VectorMatrix, VoxelField
+from nerf_lightning.model.hashgrid import cubic_cells
+
+NUM_SAMPLES, NUM_RAYS = 1 << 15, 1 << 12
+MAX_STEPS, GRID_RESOLUTION = 192, 64
+"""Steps along a ray at most, and cells along a side of the occupancy grid."""
+MIN_TRANSMITTANCE, MIN_THICKNESS, MIN_SAMPLE_WEIGHT = 1e-4, 5e-3, 1e-2
+MIN_KINK_DISTANCE = 1e-5
+"""Distance from zero that counts as near for a rectifier."""
+PRUNED_FRACTION = 1 / 3
+"""Share of the voxels' vertices that are not kept."""
+
+Outputs = Sequence[Tensor]
+
+
+@dataclass(frozen=True)
+class Case:
+    """A kernel as a training calls it; which version runs is for `set_kernels` and the inputs' device to say."""
+
+    call: Callable[..., Tensor | Outputs]
+    inputs: tuple[Tensor, ...]
+    """On the CPU."""
+    num_trainable: int = 0
+    """How many of the inputs, from the first, get a gradient."""
+    kind: str = "dense"
+    """What comes out: "dense" tensors of one size; "packed" samples, however many; "rows" rows and their weights."""
+
+    def to_device(self, device: torch.device) -> tuple[Tensor, ...]:
+        """Fresh inputs there, those that learn as leaves."""
+        copies = [x.detach().to(device, copy=True) for x in self.inputs]
+        return tuple(x.requires_grad_() if number < self.num_trainable else x for number, x in enumerate(copies))
+
+    def outputs(self, inputs: tuple[Tensor, ...]) -> list[Tensor]:
+        """What comes out, as a list."""
+        out = self.call(*inputs)
+        return [out] if isinstance(out, Tensor) else list(out)
+
+    def gradients(self, inputs: tuple[Tensor, ...], outputs: list[Tensor], above: list[Tensor]) -> list[Tensor]:
+        """Those of the inputs that learn, `above` being what the outputs' are; none where none does."""
+        learning = inputs[: self.num_trainable]
+        return list(torch.autograd.grad(outputs, learning, above)) if learning else []
+
+
+@contextmanager
+def kernel_version(choice: str) -> Iterator[None]:
+    """What `set_kernels` says, for a while."""
+    kernels.set_kernels(choice)
+    try:
+        yield
+    finally:
+        kernels.set_kernels("auto")
+
+
+def march(unbounded: bool, capacity: int | None, *tensors: Tensor) -> Outputs:
+    origins, directions, aabb, near, far, shift, occupied = tensors
+    rays, bounds = Rays(origins, directions), Bounds(aabb, unbounded)
+    return kernels.march(rays, bounds, near, far, shift, occupied, MAX_STEPS, 3.46 / MAX_STEPS, capacity)
+
+
+def filter_visible(capacity: int | None, optical_depth: Tensor, *packed: Tensor) -> Outputs:
+    t, dt, ray, offsets = packed
+    return kernels.filter_visible(optical_depth, (t, dt, ray, offsets), MIN_TRANSMITTANCE, MIN_THICKNESS, capacity)[1]
+
+
+def merge_low_weight(optical_depth: Tensor, *packed: Tensor) -> Outputs:
+    t, dt, ray, offsets = packed
+    return kernels.merge_low_weight(optical_depth, (t, dt, ray, offsets), MIN_SAMPLE_WEIGHT)[1]
+
+
+def mark_cells(marks: Tensor, aabb: Tensor, positions: Tensor) -> Tensor:
+    marks = marks.clone()
+    kernels.mark_cells(marks, 3, Bounds(aabb), positions)
+    return marks
+
+
+def mark_rows(seen: Tensor, rows: Tensor) -> Tensor:
+    seen = seen.clone()
+    kernels.mark_rows(seen, rows, 3)
+    return seen
+
+
+def mlp(x: Tensor, *rest: Tensor) -> Tensor:
+    """The layers' matrices and biases in turn, then the extra inputs."""
+    *flat, extra = rest
+    return kernels.mlp(x, list(zip(flat[::2], flat[1::2], strict=True)), extra)
+
+
+def plane_line_sum_and_products(*tensors: Tensor) -> Outputs:
+    planes, lines, others, other_lines, unit = tensors
+    return kernels.plane_line_sum_and_products((planes, lines), (others, other_lines), unit)
+
+
+def total_variation(values: Tensor, vertex: Tensor, index: Tensor) -> Tensor:
+    return kernels.total_variation(values, vertex, index, 1, len(vertex))
+
+
+def hash_interpolate(cells: Sequence[tuple[int, ...]], sizes: list[int], tables: Tensor, unit: Tensor) -> Tensor:
+    return kernels.hash_interpolate(tables, unit, cells, sizes)
+
+
+def make_converging_rays(unbounded: bool) -> tuple[Tensor, ...]:
+    """Rays from a sphere of radius 4 toward the middle of a box, the box, where rays begin and end, their shifts, and a ball
+    of occupied cells: what `march` takes."""
+    origins = 4 * normalize(torch.randn(NUM_RAYS, 3), dim=1)
+    directions = normalize(0.5 * torch.randn(NUM_RAYS, 3) - origins, dim=1)
+    axis = (torch.arange(GRID_RESOLUTION) + 0.5) / (GRID_RESOLUTION / 2) - 1
+    ball = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2 < 0.1).flatten()
+    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded)
+    return origins, directions, box.aabb, *box.near_far(Rays(origins, directions)), torch.rand(NUM_RAYS), ball
+
+
+def sparsify(field: VoxelField) -> None:
+    """Leaves out some of a field's vertices, and gives the others something to tell."""
+    keep = torch.rand(len(field.index)) > PRUNED_FRACTION
+    rows = 1 + int(keep.sum())
+    field.set_vertices(keep, [torch.randn(rows, *table.shape[1:]) for table in field.tables])
+
+
+@torch.no_grad()
+def avoid_kinks(x: Tensor, extra: Tensor, layers: Sequence[torch.nn.Linear]) -> Tensor:
+    """Rows of inputs at which no rectifier is so near to where it opens that rounding decides whether a gradient passes."""
+    h, clear = torch.cat([x, extra], dim=1), torch.ones(len(x), dtype=torch.bool)
+    for layer in layers[:-1]:
+        before = layer(h)
+        clear &= (before.abs() > MIN_KINK_DISTANCE).all(1)
+        h = torch.relu(before)
+    return clear.nonzero()[:, 0]
+
+
+def make_cases(choice: str = "reference") -> dict[str, Case]:
+    """All kernels by name; what some take from others is laid out in memory as that version leaves it."""
+    with kernel_version(choice):
+        return _make_cases()
+
+
+def _make_cases() -> dict[str, Case]:
+    torch.manual_seed(0)
+    bounded, unbounded = (make_converging_rays(boundless) for boundless in (False, True))
+    origins, directions, aabb = bounded[:3]
+    packed = tuple(march(False, None, *bounded))
+    t, dt, ray, _ = packed
+    capacity = 5 * len(t) // 4  # as samplers leave where nobody waits to count
+    roomy = tuple(march(False, capacity, *bounded))
+    density = 100 * torch.rand(len(t)) ** 3  # some hold nothing, and some end their ray
+    rgb = torch.rand(3, len(t)).T
+    unit = Bounds(aabb).to_unit(kernels.ray_positions(origins, directions, ray, t))[:NUM_SAMPLES]
+    seen_from = directions[ray][:NUM_SAMPLES]
+    harmonics = kernels.spherical_harmonics(seen_from)
+    grid, picture = HashGrid(cubic_cells(8, 16, 256), 17, 2), HashGrid2DField((512, 512)).grid
+    layers = [torch.nn.Linear(i, o) for i, o in ((31, 32), (32, 32), (32, 3))]
+    flat = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
+    features = torch.rand(15, len(unit)).T
+    clear = avoid_kinks(features, harmonics, layers)
+    factors, colours = VectorMatrix(128, 16), VectorMatrix(128, 16)
+    voxels = VoxelField(Bounds(aabb), base_resolution=64, max_resolution=64, stages=1)
+    sparsify(voxels)
+    rows, weights = kernels.locate_vertices(voxels.index, unit)
+    marks = torch.zeros(GRID_RESOLUTION**3, dtype=torch.int32)
+    return {
+        "march": Case(partial(march, False, None), bounded, kind="packed"),
+        "march, unbounded": Case(partial(march, True, None), unbounded, kind="packed"),
+        "march, into capacity": Case(partial(march, False, capacity), bounded, kind="packed"),
+        "ray_positions": Case(kernels.ray_positions, (origins, directions, ray, t)),
+        "filter_visible": Case(partial(filter_visible, None), (density * packed[1], *packed), kind="packed"),
+        "filter_visible, into capacity": Case(
+            partial(filter_visible, capacity),
+            (density[torch.arange(capacity) % len(t)] * roomy[1], *roomy),
+            kind="packed",
+        ),
+        "merge_low_weight": Case(merge_low_weight, (density * packed[1], *packed), kind="packed"),
+        "mark_cells": Case(mark_cells, (marks, aabb, kernels.ray_positions(origins, directions, ray, t))),
+        "hash_interpolate": Case(
+            partial(hash_interpolate, grid.cells, grid.sizes), (grid.tables, unit), num_trainable=1
+        ),
+        "hash_interpolate_2d": Case(
+            partial(hash_interpolate, picture.cells, picture.sizes),
+            (picture.tables, torch.rand(NUM_SAMPLES, 2)),
+            num_trainable=1,
+        ),
+        "mlp": Case(mlp, (features.T[:, clear].T, *flat, harmonics.T[:, clear].T), num_trainable=1 + len(flat)),
+        "spherical_harmonics": Case(kernels.spherical_harmonics, (seen_from,)),
+        "plane_line_products": Case(
+            kernels.plane_line_products, (factors.planes, factors.lines, unit), num_trainable=2
+        ),
+        "plane_line_sum": Case(kernels.plane_line_sum, (factors.planes, factors.lines, unit), num_trainable=2),
+        "plane_line_sum_and_products": Case(
+            plane_line_sum_and_products,
+            (factors.planes, factors.lines, colours.planes, colours.lines, unit),
+            num_trainable=4,
+        ),
+        "locate_vertices": Case(kernels.locate_vertices, (voxels.index, unit), kind="rows"),
+        "mark_rows": Case(mark_rows, (voxels.last_read_step, rows)),
+        "interpolate_voxels": Case(
+            kernels.interpolate_voxels, (*voxels.tables, rows, weights, harmonics[:, 1:4]), num_trainable=3
+        ),
+        "interpolate_scalar": Case(kernels.interpolate_scalar, (voxels.log_density, voxels.index, unit)),
+        "total_variation": Case(
+            total_variation, (voxels.log_density, voxels.vertex_of_row, voxels.index), num_trainable=1
+        ),
+        "composite": Case(kernels.composite, (density, rgb, *packed), num_trainable=2),
+    }

@@ -1,0 +1,133 @@
+"""The report of a capture: three pictures that show whether to trust it."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+
+from nerf_lightning.capture.pipeline import Capture
+from nerf_lightning.capture.poses.bundle_adjustment import LENS_PARAMETERS, lens_to_vector
+from nerf_lightning.capture.poses.calibrate import Calibration
+from nerf_lightning.capture.poses.geometry import apply_pose
+from nerf_lightning.capture.poses.pose_solver import RegisteredPhoto
+from nerf_lightning.capture.report.tag_sheet import draw_tag_sheet, subsample_photos
+from nerf_lightning.dataset.intrinsics import Intrinsics
+from nerf_lightning.drawing.camera_map import plot_camera_map
+from nerf_lightning.drawing.panels import write_png
+from nerf_lightning.drawing.style import (
+    BLUE,
+    DPI,
+    FONT,
+    SKY,
+    VERMILLION,
+    choose_magnification,
+    rasterize_figure,
+    replace_missing_glyphs,
+    set_image_axes,
+    shorten,
+)
+
+MAX_LABELS = 60
+"""Photos whose names fit below the bars."""
+
+
+def write_report(capture: Capture, folder: Path) -> list[Path]:
+    """Writes the pictures to look at after a capture.
+
+    - `tags.png`: the photos of both folders with their tags, and why some were left out;
+    - `errors.png`: the reprojection error by photo, where in the picture corners were seen and how they are off, and the lens;
+    - `cameras.png`: the cameras, the tags, the box and the orbit of the scene, from above and from the side.
+
+    Returns:
+        The files, in this order.
+
+    Raises:
+        InputError: a photo can no longer be read: all are read again.
+    """
+    lens = capture.calibration.lens
+    folders = {"calibration": capture.calibration.photos, "photos": capture.photos}
+    numbered = [(number, photo.c2w) for number, photo in enumerate(capture.photos, 1) if photo.c2w is not None]
+    figures = {
+        "tags": draw_tag_sheet(folders, lens.width / lens.height),
+        "errors": rasterize_figure(plot_errors(folders, capture.calibration)),
+        "cameras": rasterize_figure(plot_camera_map(numbered, capture.scene, collect_tag_corners(capture), "metres")),
+    }
+    files = [folder / f"{name}.png" for name in figures]
+    for figure, file in zip(figures.values(), files, strict=True):
+        write_png(file, figure)
+    return files
+
+
+def collect_tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
+    """Corners in the world of the tags that placed photos show, by id; metres."""
+    points = {
+        tag: detection.points for photo in capture.photos for tag, detection in photo.observation.detections.items()
+    }
+    return {tag: apply_pose(pose, points[tag]) for tag, pose in capture.solution.tags.items() if tag in points}
+
+
+def plot_errors(folders: Mapping[str, Sequence[RegisteredPhoto]], calibration: Calibration) -> Figure:
+    """For each folder, the error of every photo, and the residuals of all corners by their place in the picture, with the hull
+    of all corners; below, the lens."""
+    figure = Figure(figsize=(18, 6.5 * len(folders)), dpi=DPI, layout="constrained")
+    grid = figure.subplots(len(folders), 2, squeeze=False, width_ratios=(1.15, 1))
+    for (left, right), (title, photos) in zip(grid, folders.items(), strict=True):
+        _draw_bars(left, title, photos)
+        _draw_residuals(right, title, photos, calibration.lens)
+    figure.supxlabel(describe_lens(calibration), fontsize=12)
+    return figure
+
+
+def _draw_bars(axes: Axes, title: str, photos: Sequence[RegisteredPhoto]) -> None:
+    errors = {number: photo.reprojection_px or 0.0 for number, photo in enumerate(photos, 1) if not photo.reason}
+    left_out = [number for number, photo in enumerate(photos, 1) if photo.reason]
+    axes.bar(list(errors), list(errors.values()), color=BLUE)
+    median = float(np.median(list(errors.values())))
+    axes.axhline(median, color="black", linestyle="--", linewidth=1, label=f"median {median:.2f} px")
+    if left_out:
+        axes.plot(left_out, [0] * len(left_out), "X", color=VERMILLION, markersize=10, clip_on=False, label="left out")
+    labelled = subsample_photos(photos, MAX_LABELS)
+    labels = [f"{shorten(replace_missing_glyphs(photos[i].name), 24)}  {i + 1}" for i in labelled]
+    axes.set_xticks([i + 1 for i in labelled], labels, rotation=90, fontsize=9, fontfamily=FONT, parse_math=False)
+    axes.set_xlim(0.3, len(photos) + 0.7)
+    axes.set(title=f"{title}: reprojection error", ylabel="rms of a photo, pixels")
+    axes.margins(y=0.12)
+    axes.legend(loc="upper right", framealpha=0.9)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_residuals(axes: Axes, title: str, photos: Sequence[RegisteredPhoto], lens: Intrinsics) -> None:
+    set_image_axes(axes, lens.width, lens.height)
+    seen, residuals = collect_residuals(photos)
+    hull = cv2.convexHull(seen.astype(np.float32)).reshape(-1, 2)
+    axes.add_patch(Polygon(hull, facecolor=SKY, alpha=0.15, edgecolor="none"))
+    longest = float(np.percentile(np.linalg.norm(residuals, axis=1), 90))
+    scale = choose_magnification(longest, 0.06 * max(lens.width, lens.height))
+    axes.quiver(*seen.T, *(scale * residuals).T, angles="xy", scale_units="xy", scale=1, color=BLUE, width=0.0016)
+    covered = cv2.contourArea(hull) / (lens.width * lens.height)
+    text = (
+        f"{title}: residuals of {len(seen)} corners, {scale:g} times as long; they cover {covered:.0%} of the picture"
+    )
+    axes.set_title(text)
+
+
+def collect_residuals(photos: Sequence[RegisteredPhoto]) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]:
+    """Where all corners of photos that were used were seen, and projected minus seen; pixels."""
+    used = [
+        (photo.observation.detections[tag].pixels, rest) for photo in photos for tag, rest in photo.residuals.items()
+    ]
+    seen, residuals = zip(*used, strict=True)
+    return np.concatenate(seen), np.concatenate(residuals)
+
+
+def describe_lens(calibration: Calibration) -> str:
+    """The lens in numbers, each with its standard deviation if it was set free."""
+    values = dict(zip(LENS_PARAMETERS, lens_to_vector(calibration.lens), strict=True))
+    free = [f"{name} {values[name]:.5g} ± {deviation:.2g}" for name, deviation in calibration.deviations.items()]
+    fixed = [name for name in LENS_PARAMETERS if name not in calibration.deviations]
+    return "set free:  " + ",   ".join(free) + (f";   kept plain: {', '.join(fixed)}" if fixed else "")

@@ -1,0 +1,90 @@
+"""Points between photos of known pose: a few SIFT matches, triangulated."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.dataset.matching.epipolar import unproject
+from nerf_lightning.dataset.matching.features import detect_features, match_features
+from nerf_lightning.dataset.views import Views
+from nerf_lightning.utils.text import subsample
+
+log = logging.getLogger(__name__)
+
+MAX_PAIRS = 8
+"""Pairs of photos that are matched."""
+MIN_AXIS_COSINE = 0.85
+"""Least cosine between the axes of photos that are matched."""
+MAX_ERROR_PX, REFERENCE_SIDE_PX = 2.0, 640
+"""Largest reprojection error of a point, pixels; of larger photos, as many times more."""
+MIN_PARALLAX_RAD = 0.005
+"""Least angle between two rays, radians, that tells a depth; farther points are put where it would be that."""
+
+
+def triangulate_matches(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor, "M 3"]:
+    """Triangulates matches between pairs of photos that look in nearly the same direction from different places.
+
+    A match counts where its rays meet in front of both cameras. Points too far to tell their depth are put as near as they
+    may be.
+
+    Args:
+        views: photos; the poses of their cameras do not count.
+        c2w: OpenCV camera to world, in the frame of the points.
+    """
+    local = torch.from_numpy(c2w).clone()
+    origin = local[:, :3, 3].median(0).values
+    local[:, :3, 3] -= origin
+    cameras = replace(views.cameras, c2w=local.float())
+    pairs = find_neighbours(local)
+    found = [torch.zeros(0, 3)]
+    for pair in pairs:
+        keypoints = match_features(*(detect_features(views, view) for view in pair))
+        found.append(triangulate(cameras[torch.tensor(pair)], torch.from_numpy(keypoints)))
+    points = torch.cat(found)
+    log.info("%d points from matches between %d pairs of photos", len(points), len(pairs))
+    return points.double() + origin
+
+
+def find_neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
+    """Pairs of photos, spread over a capture: one each of which has the median baseline among those that look alike."""
+    axes, centres = normalize(c2w[:, :3, 2], dim=1), c2w[:, :3, 3]
+    pairs = set()
+    for view in subsample(len(c2w), MAX_PAIRS):
+        alike = axes @ axes[view]
+        alike[view] = -1
+        others = (alike >= min(MIN_AXIS_COSINE, float(alike.max()))).nonzero()[:, 0]
+        baseline = (centres[others] - centres[view]).norm(dim=1)
+        other = int(others[baseline.argsort()[len(others) // 2]])
+        if other != view:
+            pairs.add((min(view, other), max(view, other)))
+    return sorted(pairs)
+
+
+def triangulate(cameras: Cameras, keypoints: Float[Tensor, "N 2 2"]) -> Float[Tensor, "M 3"]:
+    """Points that two cameras see where they are said to, in pixels of their photos, in front of both."""
+    a, b = (
+        torch.from_numpy(unproject(cameras, np.full(len(keypoints), view), keypoints[:, view].float()))
+        @ cameras.c2w[view, :3, :3].double().T
+        for view in (0, 1)
+    )
+    baseline = (cameras.centres[1] - cameras.centres[0]).double()
+    # Least squares for s a - t b = baseline; the angle is held above the least that tells a depth.
+    sine = torch.linalg.cross(a, b).norm(dim=1)
+    cosine = (a * b).sum(1)
+    s = ((a - cosine[:, None] * b) @ baseline) / sine.square().clamp_min(1e-12)
+    t = ((cosine[:, None] * a - b) @ baseline) / sine.square().clamp_min(1e-12)
+    farthest = float(baseline.norm()) / MIN_PARALLAX_RAD
+    is_far = (sine < MIN_PARALLAX_RAD) | (s <= 0) | (t <= 0) | (s > farthest)
+    points = cameras.centres[0].double() + torch.where(is_far, farthest, s)[:, None] * a
+    kept = torch.ones(len(points), dtype=torch.bool)
+    for view in (0, 1):
+        pixels, _, seen = cameras.project(points.float(), view)
+        off = (pixels.double() - keypoints[:, view]).norm(dim=1)
+        kept &= seen & (off < MAX_ERROR_PX * max(1.0, max(cameras.size(view)) / REFERENCE_SIDE_PX))
+    return points[kept].float()

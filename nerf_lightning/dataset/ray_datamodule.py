@@ -1,0 +1,226 @@
+"""RayDataModule: rays and their pixels, drawn from all training photos."""
+
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
+from torch import Tensor
+
+from nerf_lightning.cameras import Rays
+from nerf_lightning.dataset.datamodule import StepDataModule
+from nerf_lightning.dataset.error_sampling import ErrorSampler
+from nerf_lightning.dataset.matching.pose_checks import SceneIssue
+from nerf_lightning.dataset.pixel_subset import ALL_PIXELS, PixelSubset
+from nerf_lightning.dataset.scene import Scene
+from nerf_lightning.dataset.scene_checks import check_scene
+from nerf_lightning.dataset.views import Views
+from nerf_lightning.utils.option_checks import Count, Ge, Le
+from nerf_lightning.utils.seeding import Stream, step_generator
+from nerf_lightning.utils.tensor_dataclass import TensorDataclass
+
+DEFAULT_RAYS, DEFAULT_SAMPLES = 1024, 16384
+"""Rays of the first step, and the samples per step that the number of rays then adapts to."""
+ErrorSampling = Annotated[float, Ge(0), Le(0.99)]
+DEFAULT_ERROR_SAMPLING = 0.5
+"""Share of the rays that are drawn by the error around them."""
+BASELINE_PIXELS = 8192
+"""Pixels drawn to measure the error of one plain colour."""
+TEXTURE_RADIUS = 0.0125
+"""How far from a pixel its photo is looked at for `measure_texturelessness`, in longer sides of the photo."""
+TEXTURE_CONTRAST = 0.01
+"""Difference of colours at which a photo is plain by 1/e: two or three steps of 8 bits, hardly more than their noise."""
+
+
+@dataclass(frozen=True)
+class RayBatch(TensorDataclass):
+    """R rays and their pixels."""
+
+    rays: Rays
+    pixels: UInt8[Tensor, "R C"]
+    """sRGB, with straight alpha where C is 4."""
+    views: Int[Tensor, "R"] | None = field(default=None, kw_only=True)
+    """The training photo that each belongs to; None where that is not asked for."""
+    texturelessness: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
+    """Of the photo around each, see `measure_texturelessness`; None where that is not asked for."""
+    weights: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
+    """How much each counts, see `ErrorSampler`; None where all count the same."""
+
+
+@dataclass(frozen=True)
+class ViewBatch(RayBatch):
+    """Rays of one view, row by row; R = height * width."""
+
+    height: int
+    width: int
+    valid_mask: Bool[Tensor, "R"] | None = None
+    """Which pixels count; None for all."""
+    strip: int | None = None
+    """See `PixelSubset.strip`."""
+
+
+def cast_rays(views: Views, pixels: Int[Tensor, "R"]) -> tuple[Rays, Int[Tensor, "R"]]:
+    """Rays through the pixels at these places in `Views.pixels`, and the photos they belong to."""
+    pixels = pixels.contiguous()  # of several processes each has every so many
+    view = torch.searchsorted(views.offsets, pixels, right=True) - 1
+    pixel, width = pixels - views.offsets[view], views.widths[view]
+    return views.cameras.generate_rays(view, pixel // width, pixel % width), view
+
+
+def make_view_batch(views: Views, view: int, subset: PixelSubset = ALL_PIXELS) -> ViewBatch:
+    """One view, or some of its pixels."""
+    rows, columns = subset.grid(*views.cameras.size(view))
+    row, column = (x.flatten() for x in torch.meshgrid(rows, columns, indexing="ij"))
+    rays = views.cameras.generate_rays(torch.full_like(row, view), row, column)
+    known = None if views.valid_mask is None else views.view_mask(view)[row, column]
+    return ViewBatch(rays, views.image(view)[row, column], len(rows), len(columns), known, subset.strip)
+
+
+def measure_texturelessness(views: Views, pixels: Int[Tensor, "R"], view: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
+    """How textureless photos are around the pixels at these places in `Views.pixels`: 1 where the colour is the same on all
+    four sides, falling toward 0 with its largest difference.
+
+    Such places look alike in photos from elsewhere too, so that these hardly tell how far they are.
+    """
+    start, width = views.offsets[view], views.widths[view]
+    pixel, height = pixels - start, (views.offsets[view + 1] - start) // width
+    row, column = pixel // width, pixel % width
+    reach = (TEXTURE_RADIUS * torch.maximum(width, height)).round().long().clamp_min(1)
+    sides = (
+        start + row * width + (column - reach).clamp_min(0),
+        start + row * width + torch.minimum(column + reach, width - 1),
+        start + (row - reach).clamp_min(0) * width + column,
+        start + torch.minimum(row + reach, height - 1) * width + column,
+    )
+    here = views.pixels[pixels].short()
+    contrast = torch.stack([(views.pixels[side].short() - here).abs().amax(1) for side in sides]).amax(0)
+    return torch.exp(-contrast / (255 * TEXTURE_CONTRAST))
+
+
+def make_batch(
+    views: Views, pixels: Int[Tensor, "R"], with_texture: bool = False, weights: Float[Tensor, "R"] | None = None
+) -> RayBatch:
+    """Rays and pixels at these places in `Views.pixels`; `weights` and, if asked for, `texturelessness` as in `RayBatch`.
+
+    Photos stay bytes, and rays are made only for these pixels: the cost does not depend on the number of photos.
+    """
+    rays, view = cast_rays(views, pixels)
+    textureless = measure_texturelessness(views, pixels, view) if with_texture else None
+    return RayBatch(rays, views.pixels[pixels], views=view, texturelessness=textureless, weights=weights)
+
+
+class RayDataModule(StepDataModule[Views]):
+    """Feeds NeRF3D.
+
+    Args:
+        scene: the photos and cameras.
+        rays: rays a step, which several processes share; with `samples`, only of the first.
+        samples: aim for this many samples a step by adapting the number of rays; None keeps `rays`.
+        seed: of the draw.
+        error_sampling: fraction of the rays drawn by the error around them, see `ErrorSampler`; 0 draws uniformly.
+    """
+
+    is_posed = True
+    MAX_RAYS_FACTOR = 32  # times the rays of the first step
+
+    def __init__(
+        self,
+        scene: Scene,
+        rays: Count = DEFAULT_RAYS,
+        samples: Count | None = DEFAULT_SAMPLES,
+        seed: int = 0,
+        error_sampling: ErrorSampling = DEFAULT_ERROR_SAMPLING,
+    ):
+        super().__init__(scene.train, seed)
+        self.scene = scene
+        self.rays = self.initial_rays = rays
+        self.samples = samples
+        self.error_sampling = error_sampling
+        self._error_sampler: ErrorSampler | None = None
+        self._sampler_state: dict[str, Tensor] = {}
+        """What `_error_sampler` goes on from, when photos are drawn from for the first time."""
+        self._with_texture = False
+        self._resolution_scale = 1.0
+
+    def scale_batch(self, factor: int) -> None:
+        """Takes that many times the rays and samples a step, for a device that takes more at once. Before training."""
+        self.rays = self.initial_rays = self.initial_rays * factor
+        self.samples = None if self.samples is None else self.samples * factor
+
+    def enable_texturelessness(self, is_enabled: bool) -> None:
+        """Sets whether batches say how textureless photos are."""
+        self._with_texture = is_enabled
+
+    def set_resolution_scale(self, scale: float) -> None:
+        """Sets the factor on the samples aimed for, see `Field.resolution_scale`: fewer meet in a small cell, and gradients
+        would be noise."""
+        self._resolution_scale = scale
+
+    def adapt_num_rays(self, drawn: int) -> None:
+        """Called with the samples that a step's rays took: moves the number of rays toward the aim."""
+        if self.samples is None:
+            return
+        # Damped, since one batch's count is noisy; bounded, since empty space would ask for endless rays.
+        wanted = self.rays * round(self.samples * self._resolution_scale) / max(drawn, 1)
+        limit = self.initial_rays * self.MAX_RAYS_FACTOR
+        self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
+
+    def update_error_map(self, errors: Float[Tensor, "R"], mask: Bool[Tensor, "R"] | None = None) -> None:
+        """Called after each step with the squared errors of all its rays, those of other processes too, and which of them were
+        measured: later steps look more where they are large."""
+        if self._error_sampler is not None:
+            self._error_sampler.update(errors, mask)
+
+    def reset(self) -> None:
+        """Before another training on the same photos: nothing is known of errors, and a first step's number of rays."""
+        self.rays = self.initial_rays
+        self._error_sampler, self._sampler_state = None, {}
+
+    def draw_batch(self, photos: Views, step: int, part: slice) -> RayBatch:
+        generator = step_generator(self.seed, Stream.BATCH, step, photos.pixels.device)
+        if self.error_sampling == 0:
+            return make_batch(photos, photos.sample_pixels(self.rays, generator)[part], self._with_texture)
+        if self._error_sampler is None or self._error_sampler.views is not photos:
+            self._sampler_state = (
+                self._sampler_state if self._error_sampler is None else self._error_sampler.state_dict()
+            )
+            self._error_sampler = ErrorSampler(photos, self.error_sampling)
+            if len(self._sampler_state.get("sums", ())) == len(
+                self._error_sampler.sums
+            ):  # else of other photos, or of none
+                self._error_sampler.load_state_dict(self._sampler_state)
+        pixels, weights = self._error_sampler.draw(self.rays, generator)
+        return make_batch(photos, pixels[part], self._with_texture, weights[part])
+
+    def make_baseline_batch(self) -> RayBatch:
+        """Training pixels to measure the error of one plain colour on."""
+        generator = step_generator(self.seed, Stream.BASELINE, 0)
+        return make_batch(self.scene.train, self.scene.train.sample_pixels(BASELINE_PIXELS, generator))
+
+    def make_warmup_batch(self) -> RayBatch:
+        """A few rays, to compile kernels with."""
+        generator = step_generator(0, Stream.BATCH, 0)
+        return make_batch(self.scene.train, self.scene.train.sample_pixels(64, generator), with_texture=True)
+
+    def find_issues(self, refines_poses: bool) -> list[SceneIssue]:
+        return check_scene(self.scene, refines_poses)
+
+    @property
+    def num_held_out_views(self) -> int:
+        return len(self.scene.val)
+
+    def count_held_out_pixels(self, view: int) -> int:
+        width, height = self.scene.val.cameras.size(view)
+        return width * height
+
+    def get_held_out_view(self, view: int, subset: PixelSubset = ALL_PIXELS) -> ViewBatch:
+        return make_view_batch(self.scene.val, view, subset)
+
+    def state_dict(self) -> dict[str, Any]:
+        state = self._sampler_state if self._error_sampler is None else self._error_sampler.state_dict()
+        return {"rays": self.rays, "error_sampler": state}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self._error_sampler, self._sampler_state = None, dict(state_dict["error_sampler"])
+        if self.samples is not None:
+            self.rays = min(self.initial_rays * self.MAX_RAYS_FACTOR, state_dict["rays"])

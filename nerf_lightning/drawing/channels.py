@@ -1,0 +1,82 @@
+"""One frame: what a view shows, channel beside channel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from numpy import ndarray
+from torch import Tensor
+
+from nerf_lightning.cameras import Cameras
+from nerf_lightning.drawing.panels import colorize_depth, depth_percentiles, to_uint8
+from nerf_lightning.renderer import RenderOutput
+from nerf_lightning.system import NeRF3D
+from nerf_lightning.system.metrics import mse_to_psnr
+from nerf_lightning.utils.text import subsample
+
+CHANNELS = ("rgb", "depth", "opacity")
+DEPTH_PROBE_VIEWS, DEPTH_PROBE_SIDE_PX = 6, 64
+"""Views, and pixels along their longer side, from which the range of depths is found."""
+BLACK = (0.0, 0.0, 0.0)
+ERROR_GAIN = 4
+"""By how much errors are magnified."""
+
+
+@dataclass(frozen=True)
+class FrameStyle:
+    """How frames are drawn."""
+
+    channels: tuple[str, ...]
+    background: tuple[float, float, float] | None
+    """What shows where nothing is, in [0, 1]; None leaves it transparent."""
+    depth_range: tuple[float, float]
+    """What is bright and what is dark in a picture of depth, in the scene's unit: one range for a whole film."""
+
+
+def measure_depth_range(system: NeRF3D, cameras: Cameras) -> tuple[float, float]:
+    """The 2nd and the 98th percentile of the depths that a few of the views show, in the scene's unit."""
+    small = cameras.rescale(min(1.0, DEPTH_PROBE_SIDE_PX / cameras.max_side))
+    visible_depths = []
+    for view in subsample(len(small), DEPTH_PROBE_VIEWS):
+        rendered = system.render(small.generate_view_rays(view).to(system.device))
+        visible_depths.append(rendered.depth[rendered.opacity > 0.5])
+    return depth_percentiles(torch.cat(visible_depths).cpu().numpy())
+
+
+def render_channels(
+    system: NeRF3D, cameras: Cameras, view: int, style: FrameStyle
+) -> dict[str, UInt8[ndarray, "H W C"]]:
+    """A view's channels; C is 4, with straight alpha, where the background is left transparent."""
+    rays = cameras.generate_view_rays(view).to(system.device)
+    rendered = system.render(rays, background=style.background or BLACK)
+    width, height = cameras.size(view)
+    shape = (height, width, -1)
+    return {name: to_uint8(render_channel(rendered, name, style).view(shape)) for name in style.channels}
+
+
+def render_channel(rendered: RenderOutput, channel: str, style: FrameStyle) -> Float[Tensor, "R C"]:
+    """What one channel shows along some rays, rendered on the style's background; black stands for a transparent one."""
+    opacity = rendered.opacity[:, None]
+    if channel == "opacity":
+        grey = opacity.expand(-1, 3)
+        return grey if style.background is not None else torch.cat([grey, torch.ones_like(opacity)], dim=1)
+    if channel == "rgb":
+        covered = rendered.rgb  # on black: premultiplied
+    else:
+        painted = colorize_depth(rendered.depth.cpu().numpy(), *style.depth_range)
+        covered = torch.from_numpy(painted).to(opacity.device) / 255 * opacity
+        if style.background is not None:
+            covered = covered + (1 - opacity) * torch.tensor(style.background, device=opacity.device)
+    if style.background is not None:
+        return covered
+    return torch.cat([covered / opacity.clamp_min(1e-6), opacity], dim=1)
+
+
+def make_error_image(
+    shown: UInt8[ndarray, "H W 3"], truth: UInt8[ndarray, "H W 3"]
+) -> tuple[UInt8[ndarray, "H W 3"], float]:
+    """The difference, magnified, and the PSNR in dB of the two as bytes."""
+    difference = np.abs(shown.astype(np.float64) - truth)
+    mse = float(np.mean((difference / 255) ** 2))
+    return (ERROR_GAIN * difference).clip(0, 255).astype(np.uint8), mse_to_psnr(mse)

@@ -1,0 +1,199 @@
+"""Several consecutive numbers as one value for numba, loaded, added, multiplied and stored in vector registers.
+
+Numba compiles short loops to scalar instructions and cannot know that rows do not overlap.
+"""
+
+import operator
+
+from llvmlite import binding, ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic, models, overload, register_model
+
+from nerf_lightning.kernels.cpu.jit import jit
+
+
+class SimdType(types.Type):
+    """`width` single-precision numbers."""
+
+    def __init__(self, width):
+        self.width = width
+        super().__init__(name=f"Lanes({width})")
+
+    def __len__(self):
+        return self.width
+
+
+@register_model(SimdType)
+class _SimdModel(models.PrimitiveModel):
+    def __init__(self, manager, lanes):
+        super().__init__(manager, lanes, ir.VectorType(ir.FloatType(), lanes.width))
+
+
+def _pointer(context, builder, types_, values, width):
+    """To `width` numbers of an array's row, given array, row and first column."""
+    array = context.make_array(types_[0])(context, builder, values[0])
+    place = [context.cast(builder, values[i], types_[i], types.intp) for i in (1, 2)]
+    pointer = cgutils.get_item_pointer(context, builder, types_[0], array, place, wraparound=False)
+    return builder.bitcast(pointer, ir.VectorType(ir.FloatType(), width).as_pointer())
+
+
+@intrinsic
+def load(typing, array, row, first, lanes):
+    """array[row, first : first + len(lanes)], inside a float32 array [., .] in C order; `lanes` is any tuple of that length."""
+    width = len(lanes)
+
+    def code(context, builder, signature, values):
+        return builder.load(_pointer(context, builder, signature.args, values, width), align=4)
+
+    return SimdType(width)(array, row, first, lanes), code
+
+
+@intrinsic
+def store(typing, array, row, first, values):
+    """array[row, first : first + width] = values."""
+
+    def code(context, builder, signature, args):
+        builder.store(args[3], _pointer(context, builder, signature.args, args, values.width), align=4)
+        return context.get_dummy_value()
+
+    return types.none(array, row, first, values), code
+
+
+@intrinsic
+def prefetch(typing, array, row, first):
+    """Brings array[row, first] and what stands beside it into the core's cache, without waiting for it."""
+
+    def code(context, builder, signature, values):
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        place = builder.bitcast(_pointer(context, builder, signature.args, values, 1), byte)
+        builder.call(ask, [place, number(0), number(3), number(1)])  # to read, more than once, data
+        return context.get_dummy_value()
+
+    return types.none(array, row, first), code
+
+
+@intrinsic
+def broadcast(typing, a, lanes):
+    """One number, once for each entry of the tuple `lanes`, or of another value."""
+    width = len(lanes)
+
+    def code(context, builder, signature, values):
+        empty = ir.Constant(ir.VectorType(ir.FloatType(), width), ir.Undefined)
+        first = builder.insert_element(empty, values[0], ir.IntType(32)(0))
+        return _shuffle(builder, first, empty, [0] * width)
+
+    return SimdType(width)(types.float32, lanes), code
+
+
+@intrinsic
+def horizontal_sum(typing, a):
+    """The sum of all lanes: that of the first half plus that of the second, and so on in each."""
+
+    def code(context, builder, signature, values):
+        found, width = values[0], 1 << (a.width - 1).bit_length()
+        nothing = ir.Constant(found.type, [0.0] * a.width)
+        found = _shuffle(
+            builder, found, nothing, [min(i, a.width) for i in range(width)]
+        )  # filled up to a power of two
+        while width > 1:
+            width //= 2
+            first, second = (_shuffle(builder, found, found, range(start, start + width)) for start in (0, width))
+            found = builder.fadd(first, second)
+        return builder.extract_element(found, ir.IntType(32)(0))
+
+    return types.float32(a), code
+
+
+def _shuffle(builder, first, second, places):
+    """The numbers at these places of two vectors joined end to end."""
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), len(places)), list(places))
+    return builder.shuffle_vector(first, second, mask)
+
+
+FEATURES = binding.get_host_cpu_features()
+HAS_FMA = FEATURES.get("fma", True)
+"""Whether the processor has fused multiply-add; only some x86 ones lack it."""
+MAX_LANES = 16 if FEATURES.get("avx512f", False) else 8
+"""Numbers in the processor's widest registers; on those whose registers hold four, two together are one value."""
+
+
+@intrinsic
+def fma(typing, a, b, c):
+    """a * b + c of three numbers or three values of one width, rounded once where the processor can."""
+
+    def code(context, builder, signature, values):
+        if not HAS_FMA:
+            return builder.fadd(builder.fmul(values[0], values[1]), values[2])
+        kind = values[0].type
+        name = f"llvm.fma.v{a.width}f32" if isinstance(a, SimdType) else "llvm.fma.f32"
+        return builder.call(
+            cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name), values
+        )
+
+    return a(a, a, a), code
+
+
+@intrinsic
+def transpose(typing, source, row, column, target, to_row, to_column, lanes):
+    """target[to_row + j, to_column + i] = source[row + i, column + j] for i and j below the length of the tuple `lanes`, a
+    power of two."""
+    width = len(lanes)
+
+    def code(context, builder, signature, values):
+        def places(start):
+            """To all rows of a block, given where its array, row and column stand among the arguments."""
+            array, first, column = values[start : start + 3]
+            kinds = signature.args[start], types.intp, signature.args[start + 2]
+            first = context.cast(builder, first, signature.args[start + 1], types.intp)
+            numbers = [builder.add(first, first.type(i)) for i in range(width)]
+            return [_pointer(context, builder, kinds, (array, number, column), width) for number in numbers]
+
+        rows, half = [builder.load(place, align=4) for place in places(0)], width // 2
+        lower = [i // 2 + width * (i % 2) for i in range(width)]
+        mixes = lower, [place + half for place in lower]
+        for _ in range(width.bit_length() - 1):  # each time, what says the row takes a bit from what says the column
+            rows = [_shuffle(builder, rows[i], rows[i + half], mix) for i in range(half) for mix in mixes]
+        for found, place in zip(rows, places(3), strict=True):
+            builder.store(found, place, align=4)
+        return context.get_dummy_value()
+
+    return types.none(source, row, column, target, to_row, to_column, lanes), code
+
+
+@jit
+def transpose_blocks(source, row, column, target, to_row, to_column, height, width, block):
+    """target[to_row + j, to_column + i] = source[row + i, column + j] for i < height and j < width, by squares with a side as
+    long as the tuple `block`."""
+    side = len(block)
+    for i in range(0, height - side + 1, side):
+        for j in range(0, width - side + 1, side):
+            transpose(source, row + i, column + j, target, to_row + j, to_column + i, block)
+    for i in range(height):
+        for j in range(width - width % side if i < height - height % side else 0, width):
+            target[to_row + j, to_column + i] = source[row + i, column + j]
+
+
+@intrinsic
+def _emit_add(typing, a, b):
+    return a(a, b), lambda context, builder, signature, values: builder.fadd(*values)
+
+
+@intrinsic
+def _emit_multiply(typing, a, b):
+    return a(a, b), lambda context, builder, signature, values: builder.fmul(*values)
+
+
+@overload(operator.add)
+def _add(a, b):
+    if isinstance(a, SimdType) and a == b:
+        return lambda a, b: _emit_add(a, b)
+
+
+@overload(operator.mul)
+def _multiply(a, b):
+    if isinstance(a, SimdType) and a == b:
+        return lambda a, b: _emit_multiply(a, b)
+    if a == types.float32 and isinstance(b, SimdType):
+        return lambda a, b: _emit_multiply(broadcast(a, b), b)

@@ -1,0 +1,123 @@
+"""Run folders as tables and charts read them: tolerant of broken ones, never executing what they hold."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.parsing import read_json, read_yaml
+
+FINISHED = ("finished", "collapsed")
+"""Status of completed runs."""
+
+FIELD_PAGE = "field.html"
+"""The name of a run's web page in its folder, as the export verb writes it and charts look for it."""
+
+
+@dataclass(frozen=True)
+class RunSummary:
+    """What is known of one run."""
+
+    folder: Path
+    config: dict[str, Any]
+    """Resolved; empty if it cannot be read."""
+    results: dict[str, Any]
+    """Content of results.json; empty if it is missing or broken."""
+    status: str
+    """As in results.json; "unfinished" without one; or "unreadable"."""
+    diagnosis: str
+
+    def get_option(self, key: str) -> Any:
+        """The value at a dotted key of the configuration, or None."""
+        node: Any = self.config
+        for part in key.split("."):
+            node = node.get(part) if isinstance(node, dict) else None
+        return node
+
+    def get_metric(self, key: str) -> float | None:
+        """A finite number from the results, or None."""
+        value = self.results.get(key)
+        return float(value) if _finite(value) else None
+
+    @property
+    def psnr(self) -> float | None:
+        return self.get_metric("psnr")
+
+    @property
+    def psnr_text(self) -> str:
+        return "no figure" if self.psnr is None else f"{self.psnr:.2f} dB"
+
+    @property
+    def curve(self) -> list[tuple[float, float, float]]:
+        """(training seconds, step, PSNR), as far as they are finite numbers."""
+        points = self.results.get("curve")
+        whole = [p for p in points if isinstance(p, list) and len(p) == 3] if isinstance(points, list) else []
+        return [(p[0], p[1], p[2]) for p in whole if all(map(_finite, p))]
+
+
+def _finite(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def read_run(folder: Path) -> RunSummary:
+    """Reads one folder; its status and diagnosis say what is missing or broken."""
+    try:
+        config = read_yaml(folder / "config.yaml", "a run's configuration in YAML")
+    except InputError:  # told by the verbs that open runs
+        config = {}
+    plain = config if isinstance(config, dict) else {}
+    if not (folder / "results.json").exists():
+        return RunSummary(folder, plain, {}, "unfinished", "no results.json yet")
+    try:
+        results = read_json(folder / "results.json", "figures", "train it again")
+    except InputError as error:
+        return RunSummary(folder, plain, {}, "unreadable", f"results.json: found {error.found}")
+    if not isinstance(results, dict):
+        return RunSummary(folder, plain, {}, "unreadable", f"results.json: a {type(results).__name__}, not a mapping")
+    diagnosis = str(results.get("diagnosis") or "")
+    return RunSummary(folder, plain, results, str(results.get("status") or "unreadable"), diagnosis)
+
+
+def find_runs(root: Path) -> list[RunSummary]:
+    """All runs in a folder and below it, in the order of their names.
+
+    Raises:
+        InputError: where there is no such folder, or no run in it.
+    """
+    if not root.is_dir():
+        raise InputError(root, "", "no such folder", "a folder of runs", "look below outputs/")
+    folders = {path.parent for name in ("results.json", "config.yaml") for path in root.rglob(name)}
+    if not folders:
+        raise InputError(root, "", "no run in it", "folders with a config.yaml and a results.json")
+    return [read_run(folder) for folder in sorted(folders)]
+
+
+def flatten_config(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested configuration with dotted keys; lists stay whole."""
+    pairs: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        pairs |= flatten_config(value, f"{name}.") if isinstance(value, dict) else {name: value}
+    return pairs
+
+
+def find_varying_options(runs: Sequence[RunSummary]) -> list[str]:
+    """The options in which runs differ, as dotted keys; `recipe` and `method` stand for all that they set."""
+    options = [flatten_config(run.config) for run in runs if run.config]
+    common = [key for key in (options[0] if options else {}) if all(key in other for other in options)]
+    keys = [key for key in common if any(other[key] != options[0][key] for other in options)]
+    if "recipe" in keys and all(other["recipe"] for other in options):
+        keys = [key for key in keys if key == "recipe" or not _is_set_by_recipe(key, options)]
+    if "method" in keys:
+        keys = [key for key in keys if not key.startswith("model.")]
+    kept: dict[tuple[str, str], str] = {}
+    for key in sorted(keys, key=lambda key: key.count(".")):  # dataset.seed only repeats seed
+        kept.setdefault((key.rsplit(".", 1)[-1], str([other[key] for other in options])), key)
+    return [key for key in keys if key in kept.values() and not key.endswith("_target_")]
+
+
+def _is_set_by_recipe(key: str, options: Sequence[dict[str, Any]]) -> bool:
+    """Whether runs of one recipe have one value at `key`."""
+    return len({(one["recipe"], str(one[key])) for one in options}) == len({one["recipe"] for one in options})

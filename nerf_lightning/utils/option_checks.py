@@ -1,0 +1,132 @@
+"""Checks options against the signature they configure, so that errors name the config's keys."""
+
+import inspect
+import operator
+import types
+import typing
+from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Annotated, Any, Literal
+
+from nerf_lightning.errors import InputError
+from nerf_lightning.utils.text import suggest
+
+MAX_INT = 2**63 - 1
+"""The largest whole number that tensors hold."""
+MAX_FLOAT = (2 - 2**-23) * 2.0**127
+"""The largest number of single precision, in which nearly everything is computed."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """A bound on an option, stated in its annotation."""
+
+    phrase: str
+    compare: Callable[[Any, float], bool]
+    value: float
+
+
+Ge, Le = partial(Bound, "at least", operator.ge), partial(Bound, "at most", operator.le)
+Gt, Lt = partial(Bound, "above", operator.gt), partial(Bound, "below", operator.lt)
+
+PositiveFloat = Annotated[float, Gt(0)]
+LossWeight = Annotated[float, Ge(0)]
+"""Of a term of the loss; 0 does without it."""
+
+
+Count = Annotated[int, Ge(1)]
+GridSize = Annotated[int, Ge(1), Le(2**20)]
+"""Cells along a side of a grid: single precision tells 16 places within each apart, and their cube is below `MAX_INT`."""
+Log2Size = Annotated[int, Ge(1), Le(30)]
+"""Logarithm of the entries of a table, which are indexed with 32 bits."""
+Layers = Annotated[int, Ge(1), Le(1024)]
+"""Layers or levels, which are made and run one after the other."""
+Frequencies = Annotated[int, Ge(0), Le(127)]
+"""A number of frequencies, each twice the one before: the next is infinite in single precision."""
+Fraction = Annotated[float, Ge(0), Le(1)]
+SHDegree = Annotated[int, Ge(0), Le(3)]
+"""Of spherical harmonics."""
+Seed = Annotated[int, Ge(0), Le(2**32 - 1)]
+Port = Annotated[int, Ge(0), Le(65535)]
+FramesPerSecond = Annotated[float, Ge(0.01), Le(1000)]
+"""Films state how long a frame stays in thousandths of a second."""
+
+
+def check_options(
+    where: str,
+    target: Callable,
+    options: Mapping[str, Any],
+    bound_arguments: Container[str] = (),
+    require_all: bool = True,
+    source: str = "config",
+) -> None:
+    """Raises InputError if an option is unknown, missing, of the wrong type, not finite or out of its bounds.
+
+    Args:
+        where: the config group, for the message; "" for the top level.
+        target: the class or function that takes the options.
+        options: names and plain values.
+        bound_arguments: names of further arguments that will be passed.
+        require_all: whether the target gets no other arguments later.
+        source: what holds the options, for the message.
+    """
+    parameters = inspect.signature(target).parameters
+    hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target, include_extras=True)
+    open_ended = any(p.kind is inspect.Parameter.VAR_KEYWORD for p in parameters.values())
+    prefix = f"{where}." if where else ""
+    for name, value in options.items():
+        if name not in parameters and open_ended:
+            continue
+        if name not in parameters:
+            known = ", ".join(key for key in parameters if key not in bound_arguments and key != "self")
+            raise InputError(source, prefix + name, "an unknown option", f"one of {known}", suggest(name, parameters))
+        annotation = hints.get(name, Any)
+        if not _matches_type(value, annotation):
+            raise InputError(source, prefix + name, repr(value)[:60], _describe_type(annotation))
+    for name, parameter in parameters.items():
+        kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
+        required = parameter.default is inspect.Parameter.empty and parameter.kind in kinds
+        if require_all and required and name not in options and name not in bound_arguments:
+            expected, hint = _describe_type(hints.get(name, Any)), f"give {prefix}{name}=..."
+            raise InputError(source, prefix + name, "nothing", expected, hint)
+
+
+def _matches_type(value: Any, annotation: Any) -> bool:
+    """Whether a value from YAML fits an annotation; annotations other than plain values always fit."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        bounds = [bound for bound in arguments[1:] if isinstance(bound, Bound)]
+        return _matches_type(value, arguments[0]) and all(bound.compare(value, bound.value) for bound in bounds)
+    if origin in (typing.Union, types.UnionType):
+        return any(_matches_type(value, argument) for argument in arguments)
+    if origin is Literal:
+        return value in arguments
+    if origin in (list, Sequence):
+        return isinstance(value, list | tuple) and all(_matches_type(item, arguments[0]) for item in value)
+    if annotation is dict:
+        return isinstance(value, Mapping)
+    if annotation is float:
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_FLOAT
+    if annotation is int:
+        return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_INT
+    if annotation in (str, bool, type(None)):
+        return isinstance(value, annotation)
+    # YAML cannot hold other classes, but a mapping may describe one (with a target of its own).
+    return annotation is Any or not inspect.isclass(annotation) or isinstance(value, (annotation, Mapping, list))
+
+
+def _describe_type(annotation: Any) -> str:
+    """An annotation in words."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        bounds = [f"{bound.phrase} {bound.value:.12g}" for bound in arguments[1:] if isinstance(bound, Bound)]
+        return f"{_describe_type(arguments[0])} {' and '.join(bounds)}"
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(_describe_type(argument) for argument in arguments)
+    if origin is Literal:
+        return f"one of {', '.join(map(str, arguments))}"
+    if origin in (list, Sequence):
+        return f"a list, each {_describe_type(arguments[0])}"
+    words = {int: "a whole number", float: "a number", str: "text", bool: "true or false", dict: "options by name"}
+    return words.get(annotation, "null" if annotation is type(None) else "a value")

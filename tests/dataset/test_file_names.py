@@ -1,0 +1,62 @@
+"""Names in scene files, and the files on disk that they mean."""
+
+import unicodedata
+from pathlib import Path
+
+import pytest
+
+from nerf_lightning.dataset.formats.file_names import find_images
+from nerf_lightning.errors import InputError
+
+
+def make_files(root: Path, *names: str) -> Path:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"")
+    return root
+
+
+def find(root: Path, *names: str) -> list[Path | None]:
+    return find_images(root, names, "file")
+
+
+FOUND = {
+    "exact": ("images/a.png", "images/a.png"),
+    "without extension": ("images/a", "images/a.png"),
+    "dot": ("./images/a", "images/a.png"),
+    "backslashes": (".\\images\\a.png", "images/a.png"),
+    "other machine": ("/home/someone/scene/images/a.png", "images/a.png"),
+    "other system": ("C:\\scans\\scene\\images\\a.png", "images/a.png"),
+    "case": ("Images/A.PNG", "images/a.png"),
+    "extension": ("images/a.jpg", "images/a.png"),
+    "other folder": ("photos/a.png", "images/a.png"),
+    "two spaces": ("images/b  c.png", "images/b  c.png"),
+    "composed": (unicodedata.normalize("NFC", "images/café.png"), unicodedata.normalize("NFD", "images/café.png")),
+    "nothing": ("images/z.png", None),
+    "number": ("images/1", None),
+}
+
+
+def test_find_images_name_means_the_one_file(tmp_path: Path):
+    cafe = unicodedata.normalize("NFD", "images/café.png")
+    others = ("images/._a.png", "images/.DS_Store", "masks/a.png", "images_4/a.png", "images/10.png")
+    root = make_files(tmp_path, "images/a.png", "images/b  c.png", cafe, *others)
+    for case, (name, expected) in FOUND.items():
+        assert find(root, name) == [None if expected is None else root / expected], case
+
+
+def test_find_images_folders_decide(tmp_path: Path):
+    root = make_files(tmp_path, "images/front/0.png", "images/back/0.png")
+    assert find(root, "/data/Front/0.PNG") == [root / "images/front/0.png"]
+    with pytest.raises(InputError, match=r"'0\.jpg', which may mean 2 files: images/back/0\.png, images/front"):
+        find(root, "0.jpg")
+
+
+def test_find_images_file_has_one_name(tmp_path: Path):
+    """Test poses whose photos are not there must not take the training photos of the same numbers."""
+    root = make_files(tmp_path, "train/1.png")
+    file = root / "train/1.png"
+    assert find(root, "test/1.png", "train/1.png") == [None, file]
+    assert find(root, "/data/test/1.png", "/data/train/1.png") == [None, file]
+    with pytest.raises(InputError, match="'a/1.png' and 'b/1.png', of which only"):
+        find(root, "a/1.png", "b/1.png")

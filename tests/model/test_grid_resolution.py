@@ -1,0 +1,98 @@
+"""Grids no finer than the photos can show."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+
+from nerf_lightning.cameras import Bounds, bounds
+from nerf_lightning.config.compose import compose_config
+from nerf_lightning.dataset import RayDataModule, save_npz
+from nerf_lightning.model import HashGridField, TensoRFField, VoxelField
+from nerf_lightning.model import tensorf as planes
+from nerf_lightning.runs.folder import load_run
+from nerf_lightning.synthetic.objects import MARBLE, make_object_scene
+from nerf_lightning.training.train import train
+
+BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])
+
+
+def hashgrid(bounds: Bounds, base_resolution: int, max_resolution: int, size: str) -> list[int]:
+    field = HashGridField(
+        bounds,
+        num_levels=3,
+        log2_hashmap_size=8,
+        base_resolution=base_resolution,
+        max_resolution=max_resolution,
+        size=size,
+    )
+    return [side for side, *_ in field.grid.cells]
+
+
+def tensorf(bounds: Bounds, base_resolution: int, max_resolution: int, size: str) -> list[int]:
+    return TensoRFField(bounds, 2, 2, base_resolution, max_resolution, size=size).resolutions
+
+
+def voxels(bounds: Bounds, base_resolution: int, max_resolution: int, size: str) -> list[int]:
+    return VoxelField(bounds, base_resolution, max_resolution, size=size).growth.resolutions
+
+
+GRIDS = pytest.mark.parametrize("resolutions", [hashgrid, tensorf, voxels])
+Resolutions = Callable[[Bounds, int, int, str], list[int]]
+
+
+@pytest.mark.parametrize(("unbounded", "across"), [(False, 20), (True, 40)])
+def test_pixels_across_are_of_unit_cube(unbounded: bool, across: int):
+    assert Bounds(BOX, unbounded, pixel_footprint=0.1).unit_cube_pixels == pytest.approx(across)
+    # A step of one pixel along the longest axis is one part in so many of the unit cube.
+    bounds = Bounds(BOX, unbounded, pixel_footprint=0.1)
+    step = bounds.to_unit(torch.tensor([0.1, 0, 0])) - bounds.to_unit(torch.zeros(3))
+    assert float(step[0]) == pytest.approx(1 / across)
+
+
+@GRIDS
+def test_grid_auto_size_has_two_cells_a_pixel_at_most(resolutions: Resolutions):
+    bounds = Bounds(BOX, pixel_footprint=0.1)
+    auto, fixed = resolutions(bounds, 16, 100, "auto"), resolutions(bounds, 16, 100, "fixed")
+    assert auto[0] == fixed[0] == 16 and auto[-1] == 40 and fixed[-1] == 100
+    assert resolutions(bounds, 16, 30, "auto") == resolutions(bounds, 16, 30, "fixed")
+    assert resolutions(Bounds(BOX), 16, 100, "auto") == fixed, "without photos sizes are as asked"
+    assert set(resolutions(Bounds(BOX, pixel_footprint=0.5), 16, 100, "auto")) == {8}, (
+        "few pixels lower the coarsest too"
+    )
+
+
+@pytest.mark.parametrize(
+    ("unbounded", "across", "max_resolution", "width"),
+    [(False, 150, 160, 32), (False, 450, 240, 48), (False, 9000, 320, 64), (True, 800, 160, 32)],
+)
+def test_tensorf_large_photos_enlarge_planes_and_network(unbounded: bool, across: int, max_resolution: int, width: int):
+    """Planes have numbers in proportion to the width of the photos, the network neurons in proportion to the planes' side."""
+    bounds = Bounds(BOX, unbounded, pixel_footprint=2 / across)
+    field, given = TensoRFField(bounds, 2, 2), TensoRFField(bounds, 2, 2, max_resolution=100, width=24)
+    assert field.resolutions[-1] == max_resolution and field.colour_net[0].out_features == width
+    assert given.resolutions[-1] == 100 and given.colour_net[0].out_features == 24
+    assert TensoRFField(bounds, 2, 2, max_resolution=100).colour_net[0].out_features == 32
+    assert TensoRFField(Bounds(BOX, unbounded), 2, 2, base_resolution=200).resolutions[-1] == 200
+
+
+def test_run_on_large_photos_has_finer_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
+    monkeypatch.setattr(planes, "MIN_STEPS_PER_STAGE", 2)
+    monkeypatch.setattr(planes, "FINEST", 24)
+    save_npz(make_object_scene(MARBLE, size=24, views=5, held_out=1), tmp_path / "scene.npz")
+    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "model.base_resolution=8"]
+    given += ["model.size=fixed", "model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "~logger"]
+    told: list[float] = []
+    monkeypatch.setattr(RayDataModule, "note_samples", lambda data, drawn: told.append(data._resolution_scale))
+    train(
+        compose_config(
+            [*given, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "budget.steps=7"], tmp_path / "run"
+        )
+    )
+    found = load_run(tmp_path / "run").system
+    finer = found.field.resolution_scale
+    assert told == [1.0] * 4 + [finer] * 3, "the data aims for more samples once the field is finer"
+    assert finer > 1.1 and found.sampler.samples == 3 * found.sampler.grid.resolution > 192 * 1.1
+    assert found.field.resolutions[-1] == round(24 * finer)
