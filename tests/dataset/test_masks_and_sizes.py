@@ -133,7 +133,7 @@ def test_open_scene_masks_over_one_colour_cut_out(views: Views, tmp_path: Path):
     folder = capture(tmp_path, views, background=255)
     write_masks(folder / "images_mask", views)
     assert open_scene(str(folder)).train.channels == 4, "these photos are cut out already"
-    assert open_scene(str(folder), options=PhotoLoadOptions(masked="unknown")).train.channels == 3
+    assert open_scene(str(folder), options=PhotoLoadOptions(masked="ignore")).train.channels == 3
 
 
 def test_open_scene_mask_options_are_followed(views: Views, tmp_path: Path, caplog: pytest.LogCaptureFixture):
