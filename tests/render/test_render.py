@@ -59,7 +59,7 @@ def test_render_compact_file_and_the_same_command_reuses_frames(
         render(compact, frames=2, background="transparent", output=frames)
         assert there in capsys.readouterr().out
     assert imageio.imread(frames / "00001.png").shape == (16, 16, 4)
-    with pytest.raises(InputError, match="something else in it"):
+    with pytest.raises(InputError, match="holds other files"):
         render(compact, frames=2, background="white", output=frames)
 
 

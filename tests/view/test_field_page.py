@@ -156,5 +156,5 @@ def test_live_shows_progress_and_does_not_change_training(tmp_path: Path, monkey
 
 def test_live_image_run_raises(tmp_path: Path):
     flat = ["+experiment=smoke_2d", "dataset.max_side=16", "budget.steps=2", "callbacks.orbit=null", "~logger"]
-    with pytest.raises(InputError, match="callbacks: found live"):
+    with pytest.raises(InputError, match="callbacks: live needs"):
         train(compose_config([*flat, "callbacks=live"], tmp_path / "b"))
