@@ -45,7 +45,7 @@ def lock_folder(folder: Path) -> Iterator[None]:
         lock.acquire()
     except Timeout as error:
         hint = "wait until it ends, or give another folder"
-        raise RunFolderInUse(folder, "", "another run is writing into it", hint=hint) from error
+        raise RunFolderInUse(folder, "", "a run is in progress in it", hint=hint) from error
     if is_empty(folder):
         (folder / RUN_MARKER).touch()
     try:
