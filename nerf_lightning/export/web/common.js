@@ -1,4 +1,4 @@
-// What the pages of scenes and of images share.
+// Shared by the pages of scenes and of pictures.
 "use strict";
 
 const $ = id => document.getElementById(id);

@@ -1,4 +1,4 @@
-// The page: what a person's mouse, fingers and keys do, and what the controls show.
+// Page of a field: mouse, touch and keyboard input, and the controls.
 
 const about = JSON.parse($("about").textContent);
 const QUALITY = [[0.2, 6], [0.35, 12], [0.5, 20], [0.75, 30], [1, 45]];  // share of the screen's pixels at rest, milliseconds while moving
@@ -31,7 +31,7 @@ class Page {
     this.resize();
   }
 
-  // Something changed: a coarse picture next, and a fine one when it rests.
+  // After a change: a coarse picture next, and a fine one at rest.
   changed(by = "touch") {
     this.moved = performance.now();
     this.dirty = true;
@@ -63,7 +63,7 @@ class Page {
       this.canvas.dataset.drawn = "fine";
       this.resting?.();
       this.resting = this.last = null;
-      return;                               // nothing happens until something changes
+      return;                               // idle until the next change
     }
     this.wake();
   }
@@ -92,7 +92,7 @@ class Page {
     if (on) this.changed("turntable");
   }
 
-  // As measured while the last pictures were drawn.
+  // Measured while drawing the last pictures.
   get quick() { return this.renderer.perPixel * this.canvas.width * this.canvas.height / 4 < QUICK; }
 
   resize() {
@@ -107,7 +107,7 @@ class Page {
     return [(event.clientX - box.left) * this.canvas.width / box.width, (event.clientY - box.top) * this.canvas.height / box.height];
   }
 
-  // Mouse, pen and fingers: one turns, two or the right button move and come closer.
+  // Mouse, pen and touch: one pointer turns; two, or the right button, pan and zoom.
   hold() {
     const { canvas } = this, down = new Map();
     canvas.addEventListener("pointerdown", event => {
@@ -211,7 +211,7 @@ class Page {
     });
   }
 
-  // For other programs, and pages side by side: looks through a camera, on a canvas of a size if one is given.
+  // For other programs and linked pages: sets the camera, and the canvas size if given.
   show({ rows, lens }, size) {
     this.changed();
     if (size) this.fixed = size;

@@ -1,7 +1,7 @@
-// A picture's page: drag it, come closer.
+// Page of a picture: pan and zoom.
 
 const view = $("view"), picture = $("picture"), held = new Map();
-let place = [0, 0, 1];                      // of the picture's upper left corner, and its size, pixels of the screen
+let place = [0, 0, 1];                      // upper left corner of the picture (screen pixels) and scale
 
 function put(x, y, scale) {
   place = [x, y, scale];
