@@ -33,7 +33,7 @@ def orbit() -> Cameras:
 def wish(**changes: Any) -> ViewRequest:
     c2w = look_at(CENTRE + torch.tensor([3.0, 0, 0]), CENTRE, UP).double().numpy()
     given = {"c2w": c2w, "fov": 0.8, "aspect": 1.5, "channel": "rgb", "background": BLUE, "near": 0.0, "far": math.inf}
-    return ViewRequest(**{**given, "most": 60, **changes})
+    return ViewRequest(**{**given, "max_side": 60, **changes})
 
 
 @pytest.fixture(scope="module")
