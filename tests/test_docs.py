@@ -61,7 +61,7 @@ COMPOSED = (
 """Commands that start processes of their own, are tested as such elsewhere, or take long: only their words are checked."""
 PYTHON = [
     ("seconds=15", f"steps=2, options={SCENE.replace('dataset.download=false ', '').split()}"),
-    ("output=", "loss_db=100, output="),
+    ("output=", "max_psnr_drop=100, output="),
 ]
 """Replacements that make the Python block of the README small."""
 
@@ -145,7 +145,7 @@ def test_docs_page_commands_succeed(
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(block)
     if "--calibration sheet_photos" in page.read_text(encoding="utf-8"):
-        folder, _ = request.getfixturevalue("made")
+        folder, _ = request.getfixturevalue("tag_capture")
         shutil.copytree(folder / "calibration", tmp_path / "sheet_photos")
         shutil.copytree(folder / "photos", tmp_path / "object_photos")
     if "my_photos" in page.read_text(encoding="utf-8"):

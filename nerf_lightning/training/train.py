@@ -181,7 +181,7 @@ def fit(run: TrainingRun, checkpoint: Path | None) -> None:
         if checkpoint is None or run.system.state.clock.has_started or isinstance(error, InputError):
             raise
         found = f"{type(error).__name__}: {error}"  # only the checkpoint has been at work yet
-        raise InputError(checkpoint, "", found, "a state of this run to continue from", "start the run anew") from error
+        raise InputError(checkpoint, "", f"cannot be resumed ({found})", hint="start the run anew") from error
 
 
 def has_trained(trainer: L.Trainer, error: BaseException) -> bool:
