@@ -31,8 +31,6 @@ def has_fast_kernel(*tensors: Tensor, constants: tuple[Tensor, ...] = ()) -> boo
     Args:
         constants: further tensors, for which it has no gradient.
     """
-    all_tensors = (*tensors, *constants)
-    is_supported = all(
-        x.device.type == "cpu" and (x.dtype == torch.float32 or not x.is_floating_point()) for x in all_tensors
-    )
-    return _allowed and is_supported and not any(x.requires_grad for x in constants)
+    inputs = (*tensors, *constants)
+    is_fast = all(x.device.type == "cpu" and (x.dtype == torch.float32 or not x.is_floating_point()) for x in inputs)
+    return _allowed and is_fast and not any(x.requires_grad for x in constants)

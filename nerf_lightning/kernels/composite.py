@@ -138,9 +138,8 @@ def filter_visible(
     if capacity is not None or not has_fast_kernel(optical_depth, constants=(t, dt)):
         return filter_visible_reference(optical_depth, packed, early_stop_eps, min_optical_depth, capacity, max_dropped)
     keep, counts = torch.empty(len(t), dtype=torch.bool), torch.empty(len(offsets) - 1, dtype=torch.int64)
-    cpu.composite.mark_visible(
-        optical_depth, offsets, early_stop_eps, float(min_optical_depth), max_dropped, keep, counts
-    )
+    limits = early_stop_eps, float(min_optical_depth), max_dropped
+    cpu.composite.mark_visible(optical_depth, offsets, *limits, keep, counts)
     kept = offsets_from_counts(counts)
     out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
     cpu.composite.pack_visible(keep, offsets, kept, optical_depth, t, dt, out, rays)

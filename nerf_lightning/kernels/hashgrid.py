@@ -76,8 +76,6 @@ class _Levels(NamedTuple):
 def _levels(
     resolutions: tuple[GridCells, ...], sizes: tuple[int, ...], dtype: torch.dtype, device: torch.device
 ) -> _Levels:
-    """Constants for `hash_interpolate_reference`."""
-
     def int32_tensor(values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.int32, device=device)
 

@@ -125,9 +125,8 @@ def march(
     """
     if capacity is not None or not has_fast_kernel(constants=(rays.origins, rays.directions, near, far, shift)):
         return march_reference(rays, bounds, near, far, shift, occupied, samples, step, capacity, chunk)
-    return RayMarcher(rays, bounds, near, far, shift, occupied, samples, step).advance(
-        torch.arange(len(rays)), samples + 1
-    )
+    marcher = RayMarcher(rays, bounds, near, far, shift, occupied, samples, step)
+    return marcher.advance(torch.arange(len(rays)), samples + 1)
 
 
 class RayMarcher:

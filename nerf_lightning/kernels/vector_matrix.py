@@ -58,8 +58,7 @@ def _grid_sample_axes(device: torch.device) -> Int[Tensor, "3 2"]:
 def grid_sample_products(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N 3 C"]:
-    """`plane_line_products`, mode by mode, by PyTorch's own sampling of pictures: a fifth of the time of gathers on an NVIDIA
-    H200, where a gather gives each row of channels a block of threads. Apple's devices do not have its gradient."""
+    """`plane_line_products` per mode by `grid_sample`: five times as fast as gathers on an NVIDIA H200; no gradient on MPS."""
     coords = unit.clamp(0, 1).mul(2).sub(1).T
     across = coords[_grid_sample_axes(unit.device)].mT[:, None]
     along = torch.stack([torch.zeros_like(coords), coords], dim=-1)[:, None]

@@ -25,12 +25,8 @@ def level_resolutions(num_levels: int, base_resolution: int, max_resolution: int
         InputError: where base_resolution > max_resolution.
     """
     if base_resolution > max_resolution:
-        raise InputError(
-            "model.base_resolution",
-            "",
-            f"{base_resolution} with model.max_resolution={max_resolution}",
-            "0 < base_resolution <= max_resolution",
-        )
+        problem = f"{base_resolution} with model.max_resolution={max_resolution}"
+        raise InputError("model.base_resolution", "", problem, "0 < base_resolution <= max_resolution")
     growth = (max_resolution / base_resolution) ** (1 / max(num_levels - 1, 1))
     return [round(base_resolution * growth**level) for level in range(num_levels)]
 

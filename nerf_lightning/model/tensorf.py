@@ -146,9 +146,8 @@ class TensoRFField(Field):
             width = 8 * round(DEFAULT_WIDTH * resolution_scale / 8)
         base_resolution, max_resolution = self.limit_resolutions(base_resolution, max_resolution, size)
         if stages == 1 and base_resolution < max_resolution:
-            raise InputError(
-                "model.stages", "", f"1 with sizes {base_resolution} and {max_resolution}", "at least 2, or one size"
-            )
+            problem = f"1 with sizes {base_resolution} and {max_resolution}"
+            raise InputError("model.stages", "", problem, "at least 2, or one size")
         self.resolutions = level_resolutions(stages, base_resolution, max_resolution)
         if base_resolution < max_resolution:
             starts = [growth_end * i / (stages - 1) for i in range(stages)]
@@ -175,9 +174,8 @@ class TensoRFField(Field):
         return self.activation(self.density_volume.sum_components(self.bounds.to_unit(positions))) / self.unit_length
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(
-            mlp(features, layer_parameters(self.colour_net), encode_directions(directions, self.terms))
-        )
+        basis = encode_directions(directions, self.terms)
+        return torch.sigmoid(mlp(features, layer_parameters(self.colour_net), basis))
 
     def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
         self.density_volume.prune(visible_cells)

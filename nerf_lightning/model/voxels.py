@@ -83,9 +83,8 @@ class VoxelField(Field):
         base_resolution, max_resolution = self.limit_resolutions(base_resolution, max_resolution, size)
         # Early stages are short: a coarse grid converges in few steps.
         starts = [growth_end * (i / max(stages - 1, 1)) ** 2 for i in range(stages)]
-        self.growth: ResolutionSchedule = ResolutionSchedule(
-            level_resolutions(stages, base_resolution, max_resolution), starts
-        )
+        resolutions = level_resolutions(stages, base_resolution, max_resolution)
+        self.growth: ResolutionSchedule = ResolutionSchedule(resolutions, starts)
         self.terms = num_sh_bases(degree) - 1  # without the constant
         self.density_lr_scale = density_lr_scale
         # Adam moves an entry by up to its rate per step: log-density steps above 1 create fog in front of cameras.

@@ -149,9 +149,8 @@ class VolumeRenderer(torch.nn.Module):
         if output.weights is None:
             return losses
         if self.distortion_loss_weight:
-            losses["distortion"] = self.distortion_loss_weight * distortion_loss(
-                output.weights, samples, self.half_size
-            )
+            distortion = distortion_loss(output.weights, samples, self.half_size)
+            losses["distortion"] = self.distortion_loss_weight * distortion
         if near_weight := self.near_loss_weight * max(0.0, 1 - progress / NEAR_LOSS_END):
             losses["near"] = near_weight * near_loss(output.weights, samples, self.half_size)
         if self.view_loss_weight and output.view_residual is not None:

@@ -138,24 +138,19 @@ class OccupancySampler(Sampler):
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
         if generator is None:
-            steps, early_stop_eps = self.eval_samples, max(self.early_stop_eps, INVISIBLE_DEPTH)
-            depths, packed = self._march(
-                rays, density, near, far, torch.zeros_like(near), self.grid.occupied, steps, early_stop_eps
-            )
+            samples, eps = self.eval_samples, max(self.early_stop_eps, INVISIBLE_DEPTH)
+            shift, cells = torch.zeros_like(near), self.grid.occupied
+            depths, packed = self._march(rays, density, near, far, shift, cells, samples, eps)
             # Evaluation must not depend on ray chunks: only training drops steps relative to the mean.
-            depths, packed = filter_visible(
-                depths, packed, early_stop_eps, INVISIBLE_DEPTH, max_dropped=INVISIBLE_DEPTH
-            )
+            depths, packed = filter_visible(depths, packed, eps, INVISIBLE_DEPTH, max_dropped=INVISIBLE_DEPTH)
             return Samples(*packed, optical_depth=depths)
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.grid.occupied if self.full_pass else self.grid.active
-        capacity, kept_capacity = self.capacity.sizes(len(rays))
-        depths, packed = self._march(
-            rays, density, near, far, shift, cells, self.samples, self.early_stop_eps, capacity
-        )
+        (capacity, kept_capacity), eps = self.capacity.sizes(len(rays)), self.early_stop_eps
+        depths, packed = self._march(rays, density, near, far, shift, cells, self.samples, eps, capacity)
         if self.min_depth is None:
             self.min_depth = self.grid.mean_active_depth().mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
-        _, kept = filter_visible(depths, packed, self.early_stop_eps, self.min_depth, kept_capacity)
+        _, kept = filter_visible(depths, packed, eps, self.min_depth, kept_capacity)
         positions = Samples(*kept).positions(rays)
         self.grid.mark_visible(positions, self.updates)
         if capacity is not None and kept_capacity is not None:

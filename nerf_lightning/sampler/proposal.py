@@ -78,9 +78,8 @@ class ProposalSampler(Sampler):
         count, device = len(rays), near.device
         s = torch.linspace(0, 1, self.coarse_samples + 1, device=device).expand(count, -1)
         if generator is not None:
-            s = torch.cat(
-                [s[:, :1], s[:, 1:-1] + self._jitter(rays, generator) / self.coarse_samples, s[:, -1:]], dim=1
-            )
+            jitter = self._jitter(rays, generator) / self.coarse_samples
+            s = torch.cat([s[:, :1], s[:, 1:-1] + jitter, s[:, -1:]], dim=1)
         histograms: list[Histogram] = []
         for num_samples in (self.fine_samples, self.samples):
             with torch.set_grad_enabled(generator is not None):
@@ -104,8 +103,8 @@ class ProposalSampler(Sampler):
     @property
     def anneal_exponent(self) -> float:
         """Exponent of the proposal weights: 0 spreads samples evenly, 1 follows them (mip-NeRF 360, section 3.2)."""
-        pdf = min(1.0, (self.step - self.first_step + 1) / max(self.anneal, 1))
-        return ANNEAL_SLOPE * pdf / ((ANNEAL_SLOPE - 1) * pdf + 1)
+        progress = min(1.0, (self.step - self.first_step + 1) / max(self.anneal, 1))
+        return ANNEAL_SLOPE * progress / ((ANNEAL_SLOPE - 1) * progress + 1)
 
     def weights(
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]

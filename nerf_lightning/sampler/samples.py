@@ -91,9 +91,8 @@ class Samples:
         """Merges neighbouring samples if one has less than `MIN_SAMPLE_WEIGHT`; no-op if the optical depth is unknown."""
         if self.optical_depth is None:
             return self
-        optical_depth, packed = merge_low_weight(
-            self.optical_depth, (self.t, self.dt, self.ray, self.offsets), MIN_SAMPLE_WEIGHT
-        )
+        packed = self.t, self.dt, self.ray, self.offsets
+        optical_depth, packed = merge_low_weight(self.optical_depth, packed, MIN_SAMPLE_WEIGHT)
         return Samples(*packed, optical_depth=optical_depth)
 
 

@@ -76,10 +76,9 @@ class ImportanceSampler(UniformSampler):
             optical = torch.zeros(hit.shape[0], self.samples, device=edges.device)
             optical[hit[:, 0]] = (density(coarse.positions(rays)) * coarse.dt).view(-1, self.samples)
             weights = interval_weights(optical)
-        u = (torch.arange(self.importance_samples, device=edges.device) + 0.5).expand(
-            len(rays), -1
-        ) / self.importance_samples
+        count = self.importance_samples
+        u = (torch.arange(count, device=edges.device) + 0.5).expand(len(rays), -1) / count
         if self.stratified and generator is not None:
-            u = u + (torch.rand(u.shape, generator=generator, device=u.device) - 0.5) / self.importance_samples
+            u = u + (torch.rand(u.shape, generator=generator, device=u.device) - 0.5) / count
         merged = torch.cat([edges, invert_cdf(edges, weights, u)], dim=1).sort(dim=1).values
         return pack(merged, hit.expand(-1, merged.shape[1] - 1))

@@ -26,7 +26,7 @@ view.addEventListener("pointermove", event => {
   held.set(event.pointerId, [event.clientX, event.clientY]);
   const after = [...held.values()], [was, is] = [before, after].map(middle);
   put(place[0] + is[0] - was[0], place[1] + is[1] - was[1], place[2]);
-  if (after.length > 1) closer(apart(after) / apart(before), ...is);
+  if (after.length > 1) closer(spacing(after) / spacing(before), ...is);
   hideHint();
 });
 for (const name of ["pointerup", "pointercancel"]) view.addEventListener(name, event => held.delete(event.pointerId));

@@ -148,14 +148,14 @@ def interpolate(tables, unit, resolutions, sizes, out, axes, features, workers):
     """Fills out [LF, N] from tables [T, F], unit [D, N] and resolutions [L, D]. Each worker owns whole levels, so that tables
     stay in its core's cache; remaining levels are split evenly."""
     samples, levels, width = unit.shape[1], len(resolutions), len(features)
-    whole = levels - levels % workers
+    owned = levels - levels % workers
     for worker in prange(workers):
-        stretch = samples * (levels - whole)
-        begin, end, start = stretch * worker // workers, stretch * (worker + 1) // workers, 0
+        split_samples = samples * (levels - owned)
+        begin, end, start = split_samples * worker // workers, split_samples * (worker + 1) // workers, 0
         for level in range(levels):
-            passed = samples * (level - whole)
+            passed = samples * (level - owned)
             first, last = max(begin - passed, 0), min(end - passed, samples)
-            if level < whole:
+            if level < owned:
                 first, last = 0, samples if level % workers == worker else 0
             if first < last:
                 table, cells = tables[start : start + sizes[level]], cells_of(resolutions, level, axes)

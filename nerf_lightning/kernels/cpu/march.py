@@ -83,9 +83,8 @@ def cell_coordinate(u, resolution):
 @jit
 def cell_number(u, v, w, resolution):
     """Flat index of the cell of a cubic grid at a position in the unit cube."""
-    return (
-        cell_coordinate(u, resolution) * resolution + cell_coordinate(v, resolution)
-    ) * resolution + cell_coordinate(w, resolution)
+    i, j, k = cell_coordinate(u, resolution), cell_coordinate(v, resolution), cell_coordinate(w, resolution)
+    return (i * resolution + j) * resolution + k
 
 
 @jit(inline="always")
@@ -137,9 +136,8 @@ def march(rays, origins, directions, near, far, inside, shift, occupied, resolut
             empty_blocks = int(blocks[cell_number(u, v, w, cells)])
             if empty_blocks > 0:
                 if not unbounded:
-                    first = min(
-                        safe_distance(u, cells, empty_blocks, across), safe_distance(v, cells, empty_blocks, down)
-                    )
+                    first = safe_distance(u, cells, empty_blocks, across)
+                    first = min(first, safe_distance(v, cells, empty_blocks, down))
                     first = min(first, safe_distance(w, cells, empty_blocks, deep))
                     leap = int((first - t) / step - tolerance)
                     if leap > 0:

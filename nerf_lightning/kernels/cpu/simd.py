@@ -126,9 +126,8 @@ def fma(typing, a, b, c):
             return builder.fadd(builder.fmul(values[0], values[1]), values[2])
         kind = values[0].type
         name = f"llvm.fma.v{a.width}f32" if isinstance(a, SimdType) else "llvm.fma.f32"
-        return builder.call(
-            cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name), values
-        )
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name)
+        return builder.call(function, values)
 
     return a(a, a, a), code
 

@@ -141,9 +141,8 @@ def is_lit(shadow, solid, point):
 def add_colour(solids, shadow, k, point, direction, out):
     """Adds the sRGB colour of a point on solid k in a unit viewing direction to out [3]: Lambert, ambient, Blinn-Phong."""
     local, half = transform(solids.axes[k], subtract(point, solids.centre[k])), solids.half_size[k]
-    local_normal, face = find_normal(
-        solids.is_cylinder[k], (local[0] / half[0], local[1] / half[1], local[2] / half[2])
-    )
+    unit = local[0] / half[0], local[1] / half[1], local[2] / half[2]
+    local_normal, face = find_normal(solids.is_cylinder[k], unit)
     corner = (local[0] + half[0], local[1] + half[1], local[2] + half[2])
     accent = has_accent(solids.pattern[k], solids.period[k], corner[0], corner[1], corner[2], face)
     albedo = solids.accent[k] if accent else solids.colour[k]
@@ -159,9 +158,8 @@ def add_colour(solids, shadow, k, point, direction, out):
     for channel in range(3):
         ambient = FLOOR[channel] + (SKY[channel] - FLOOR[channel]) * up
         # Square root approximates the sRGB curve.
-        out[channel] += np.sqrt(
-            min(albedo[channel] * (ambient + KEY_LIGHT_WEIGHT * key + FILL_LIGHT_WEIGHT * fill) + highlight, ONE)
-        )
+        diffuse = ambient + KEY_LIGHT_WEIGHT * key + FILL_LIGHT_WEIGHT * fill
+        out[channel] += np.sqrt(min(albedo[channel] * diffuse + highlight, ONE))
 
 
 @kernel

@@ -140,12 +140,10 @@ def add_sh_weight_gradient(sh_coefficients, rows, basis, rgb, grad, lanes, worke
                 basis_row = load(tile, k, 0, lanes)
                 for corner in range(8):
                     row = rows[n, corner]
-                    weighted = rgb[0, n] * load(sh_coefficients, row, 0, lanes) + rgb[1, n] * load(
-                        sh_coefficients, row, terms, lanes
-                    )
-                    grad[n, corner] += horizontal_sum(
-                        (weighted + rgb[2, n] * load(sh_coefficients, row, 2 * terms, lanes)) * basis_row
-                    )
+                    weighted = rgb[0, n] * load(sh_coefficients, row, 0, lanes)
+                    weighted = weighted + rgb[1, n] * load(sh_coefficients, row, terms, lanes)
+                    weighted = weighted + rgb[2, n] * load(sh_coefficients, row, 2 * terms, lanes)
+                    grad[n, corner] += horizontal_sum(weighted * basis_row)
 
 
 @jit

@@ -47,8 +47,4 @@ def is_at_least_as_wide(wide: torch.nn.Module, narrow: torch.nn.Module) -> bool:
     """Whether no linear layer of `wide` is narrower than the layer of the same name in `narrow`."""
     ours = dict(wide.named_modules())
     pairs = ((ours.get(name), theirs) for name, theirs in narrow.named_modules())
-    return all(
-        x.out_features >= theirs.out_features
-        for x, theirs in pairs
-        if isinstance(x, Linear) and isinstance(theirs, Linear)
-    )
+    return all(x.out_features >= y.out_features for x, y in pairs if isinstance(x, Linear) and isinstance(y, Linear))
