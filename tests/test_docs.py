@@ -138,7 +138,9 @@ def test_docs_page_commands_succeed(
     request: pytest.FixtureRequest,
 ):
     tmp_path = place(tmp_path)
-    (tmp_path / "ladder.yaml").write_text("rungs: [{finest: 8, coarsest: 8}, {finest: 12, coarsest: 8}]\n")
+    (tmp_path / "ladder.yaml").write_text(
+        "rungs: [{max_resolution: 8, base_resolution: 8}, {max_resolution: 12, base_resolution: 8}]\n"
+    )
     files = [block for language in ("python", "yaml") for block in blocks(page, language) if block.startswith("# ")]
     for block in files:
         file = tmp_path / block.splitlines()[0].removeprefix("# ")
