@@ -107,7 +107,7 @@ class Tabletop:
             ((points > self.box[0, :2] - OBJECT_LENGTH_M) & (points < self.box[1, :2] + OBJECT_LENGTH_M)).all(-1)
         )
         local = (np.pad(points[near], ((0, 0), (0, 1))) - self.shift) / self.scale
-        out[near] = ~find_lit_points(render_shadow_map(), local)
+        out[near] = ~find_unshadowed_points(render_shadow_map(), local)
         return out
 
     def _add_object(
@@ -197,6 +197,6 @@ def _shade_points(solids, shadow, solid, points, directions, rgb):
 
 
 @compiled
-def find_lit_points(shadow, points):
+def find_unshadowed_points(shadow, points):
     """Mask of the points [N, 3], on no solid, that the key light reaches."""
     return np.array([is_lit(shadow, -1, points[n]) for n in range(len(points))])
