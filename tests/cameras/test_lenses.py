@@ -1,4 +1,4 @@
-"""Rays through lenses, against OpenCV's own."""
+"""Rays through lenses, against OpenCV."""
 
 import cv2
 import numpy as np
