@@ -183,7 +183,9 @@ def _find_nearest(solids, to_unit, origins, directions, solid, t):
             offset, half = subtract(origins[ray], solids.centre[k]), solids.half_size[k]
             # Whether the ray meets the sphere around the solid.
             if dot(offset, offset) - dot(offset, d) ** 2 / dot(d, d) < 1.0001 * dot(half, half):
-                distance = entry_distance(solids.is_cylinder[k], transform(to_unit[k], offset), transform(to_unit[k], d))
+                distance = entry_distance(
+                    solids.is_cylinder[k], transform(to_unit[k], offset), transform(to_unit[k], d)
+                )
                 if distance < t[ray]:
                     solid[ray], t[ray] = k, distance
 
