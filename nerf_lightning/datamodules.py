@@ -70,9 +70,7 @@ def build_photo_data(
     """
     if path is None:
         if url is None:
-            raise InputError(
-                "config", "dataset.path", "nothing", "the place of photos or a scene", "give dataset.path=..."
-            )
+            raise InputError("config", "dataset.path", "missing", hint="give the path of photos or a scene")
         path = fetch_published(url, Path(folder), download)
     if path is None:
         return build_bricks_data(

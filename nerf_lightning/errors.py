@@ -5,38 +5,38 @@ from contextlib import contextmanager
 from typing import Any
 
 MAX_FOUND_CHARS = 500
-"""Most letters of what was found: a file may hold any amount, and the line is for a terminal."""
+"""Most letters of a problem: a file may hold any amount, and the line is for a terminal."""
 
 
 class InputError(ValueError):
-    """Bad input from outside: a file, a config key, a command-line value.
+    """Bad input from outside. Its message is one line, which the command line prints before it exits with code 2:
 
-    The message is one line that names where, what key, what was found, what was expected and what to do.
-    The command line prints it and exits with code 2.
+    "where: key: found X, expected Y; hint" for a wrong value, "where: key: problem; hint" for all else (missing, damaged, ...).
 
     Args:
-        where: file, folder or config key with the problem.
-        key: entry inside it ("" if `where` is enough).
-        found: what is there, in words.
-        expected: what should be there, in words.
-        hint: what the user can do about it ("" if `expected` is enough).
+        where: file, folder, config group or command.
+        key: entry in it, or "".
+        problem: the value in words; without `expected` what is wrong, as a clause: "no such file".
+        expected: the valid values in words.
+        hint: what the user can do about it.
     """
 
-    def __init__(self, where: object, key: str, found: str, expected: str, hint: str = ""):
+    def __init__(self, where: object, key: str, problem: str, expected: str = "", hint: str = ""):
         location = f"{where}: {key}" if key else f"{where}"
-        if len(found) > MAX_FOUND_CHARS:
-            found = f"{found[:MAX_FOUND_CHARS]}..."
-        self.location, self.found, self.expected, self.hint = location, found, expected, hint
-        line = f"{location}: found {found}, expected {expected}" + (f"; {hint}" if hint else "")
+        if len(problem) > MAX_FOUND_CHARS:
+            problem = f"{problem[:MAX_FOUND_CHARS]}..."
+        self.location, self.problem, self.expected, self.hint = location, problem, expected, hint
+        text = f"found {problem}, expected {expected}" if expected else problem
+        line = f"{location}: {text}" + (f"; {hint}" if hint else "")
         super().__init__(" ".join(line.split()))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """So that it comes back whole from another process."""
-        return type(self), (self.location, "", self.found, self.expected, self.hint)
+        return type(self), (self.location, "", self.problem, self.expected, self.hint)
 
 
 class DiskFullError(InputError):
-    """A disk, a quota or a limit on files is full. Told as bad input is: the user can make room and go on."""
+    """A disk, a quota or a limit on file sizes is full; the user can free space and resume."""
 
 
 @contextmanager
@@ -46,4 +46,4 @@ def attribute_errors_to(path: object) -> Iterator[None]:
         yield
     except InputError as error:
         key = error.location.removeprefix("config").removeprefix(": ")
-        raise InputError(path, key, error.found, error.expected, error.hint) from error
+        raise InputError(path, key, error.problem, error.expected, error.hint) from error

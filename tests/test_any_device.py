@@ -225,7 +225,7 @@ def test_tools_run_of_cpu_work_on_device(device: torch.device, tmp_path: Path):
 
     box = (-0.9, -0.9, -0.9, 0.9, 0.9, 0.9)
     written = [
-        export_compact(run, output=tmp_path / "compact.npz", loss_db=3.0, device=NAME),
+        export_compact(run, output=tmp_path / "compact.npz", max_psnr_drop=3.0, device=NAME),
         export_mesh(run, output=tmp_path / "mesh.glb", resolution=24, box=box, device=NAME),
         export_points(run, output=tmp_path / "points.ply", resolution=24, device=NAME),
         export_voxels(run, output=tmp_path / "voxels.npz", resolution=24, device=NAME),

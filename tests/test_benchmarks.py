@@ -74,10 +74,11 @@ def test_compare_kernels_reports_wrong_kernels(few_samples: None, monkeypatch: p
 TINY = {
     kernel_cases: {"NUM_RAYS": 16, "NUM_SAMPLES": 64},
     agreement: {"TIMED_CALLS": 1, "STEPS": 2, "SCENE": ("dataset=bricks", "dataset.size=16", "dataset.train_views=10")},
-    step_time: {"WARMUP": 2, "PERIODS": 1, "METHODS": ("hashgrid",), "BLOCKS": 4, "FIRST": 1, "BLOCK": 3},
+    step_time: {"WARMUP_STEPS": 2, "TIMED_PERIODS": 1, "METHODS": ("hashgrid",)}
+    | {"NUM_BLOCKS": 4, "FIRST_TIMED_BLOCK": 1, "BLOCK_STEPS": 3},
     camera_noise: {"STEPS": 2, "CONDITIONS": {"exact": camera_noise.CONDITIONS["exact"]}},
     photos: {"SIZE": 16, "VIEWS": 6, "HELD_OUT": 2, "STEPS": 2},
-    image_fields: {"KINDS": ("clouds",), "FIELDS": ("hashgrid2d",), "SIZE": 16, "LARGE": 16},
+    image_fields: {"KINDS": ("clouds",), "FIELDS": ("hashgrid2d",), "SIZE": 16, "LARGE_SIZE": 16},
 }  # fmt: skip
 
 

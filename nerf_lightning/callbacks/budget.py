@@ -49,7 +49,7 @@ class Budget(L.Callback):
         patience: PositiveFloat | None = None,
     ):
         if steps is None and seconds is None:
-            raise InputError("budget", "", "neither steps nor seconds", "budget.steps=N or budget.seconds=S")
+            raise InputError("budget", "", "no limit on training", hint="give budget.steps=N or budget.seconds=S")
         self.steps = steps
         self.max_seconds = seconds
         self.plateau_detector = PlateauDetector(patience) if patience is not None else None

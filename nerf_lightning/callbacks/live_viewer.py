@@ -51,7 +51,7 @@ class LiveViewer(L.Callback):
     def check(self, data: DataModule) -> None:
         """Checks the data, before a run writes anything."""
         if not data.is_posed:
-            raise InputError("config", "callbacks", "live", "a scene's run", "pictures have training.gif")
+            raise InputError("config", "callbacks", "live needs a scene", hint="pictures have training.gif")
         require_viser()
 
     def setup(self, trainer: L.Trainer, pl_module: NeRF3D, stage: str) -> None:

@@ -40,7 +40,7 @@ def register_photos(
     if not any(s.detections for s in observations if s.name not in exclusions):
         found = f"no tag in {len(observations) - len(exclusions)} photos"
         advice = "are the folders swapped, or is the dictionary another one?"
-        raise InputError(folder, "", found, "photos with at least one whole tag in view", advice)
+        raise InputError(folder, "", found, hint=advice)
     solution, photos = solve_without_outliers(observations, exclusions, lambda left: solve_poses(lens, left, layout))
     untagged = [photo for photo in photos if photo.name not in exclusions and not photo.observation.detections]
     if not untagged:

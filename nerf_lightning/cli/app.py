@@ -94,10 +94,10 @@ def find_input_error(error: Exception) -> InputError | None:
     if is_disk_full(error):
         return disk_full_error(getattr(error, "filename", None) or os.getcwd())
     if isinstance(error, OSError) and error.filename:
-        return InputError(error.filename, "", str(error.strerror), "a file or folder that can be read or written")
+        return InputError(error.filename, "", str(error.strerror), hint="check the path and its permissions")
     if "torchvision::" in str(error):  # torchmetrics, which Lightning needs, imports an installed one
         hint = "pip install --force-reinstall --no-deps torchvision, from the package index that PyTorch came from"
-        return InputError("torchvision", "", str(error), "one built for this PyTorch", hint)
+        return InputError("torchvision", "", f"not built for this PyTorch ({error})", hint=hint)
     if isinstance(error, MemoryError | RuntimeError):
         from nerf_lightning.utils.memory import out_of_memory_error
 

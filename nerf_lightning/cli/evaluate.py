@@ -50,7 +50,7 @@ def evaluate(
     data = reload_data(found.cfg, found.scene, photos)
     if split == "test":
         if data.scene.test is None:
-            raise InputError("evaluate", "split", "test", "val: these photos have no test split")
+            raise InputError("evaluate", "split", "these photos have no test split", hint="give split=val")
         data.scene = replace(data.scene, val=data.scene.test)
     folder = get_output_folder(source) / "evaluation" if output is None else check_output_path(output)
     metrics, results = measure_views(found.system, data, worst)

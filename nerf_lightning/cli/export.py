@@ -174,7 +174,7 @@ def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: 
     source = find_run(run)
     target = source / "posed" if output is None else check_output_path(output)
     if target.exists():
-        raise InputError(target, "", "something", "a folder that is not there yet", "give another -o, or remove it")
+        raise InputError(target, "", "exists already", hint="give another -o, or remove it")
     content = read_scene_file(source)  # a compact file does not know corrected cameras
     data = reload_data(load_config(source), content, photos)
     if not data.is_posed:

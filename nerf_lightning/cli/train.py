@@ -92,7 +92,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
             exit_with_error(known)  # here, as Hydra would print a line of its own
 
     def refuse(message: str) -> None:
-        raise InputError("command line", "", message, "KEY=VALUE, or flags that --hydra-help lists")
+        raise InputError("command line", "", message, hint="give KEY=VALUE, or flags that --hydra-help lists")
 
     parser = get_args_parser()
     parser.allow_abbrev = False  # --experiment is not --experimental-rerun
@@ -181,7 +181,7 @@ def rewrite_overrides(words: Sequence[str], sweep: bool) -> list[str]:
     if resumes:
         folder = expand_user_path(resumes[-1].removeprefix("resume="))
         if not folder.is_dir():
-            raise InputError(folder, "", "no folder", "the folder of a run", "give resume=FOLDER")
+            raise InputError(folder, "", "no such folder", hint="give resume=FOLDER, that of a run")
         rewritten.append(make_override("hydra.run.dir", folder.absolute()))
     return quote_overrides(rewritten, sweep)
 
@@ -197,4 +197,4 @@ def translate_error(error: Exception) -> InputError:
         return InputError("command line", unknown[1], "an unknown key", f"one of {', '.join(sorted(known))}", hint)
     if re.search(r"hydra/(launcher|sweeper)", line):
         line += "; joblib, submitit_local, submitit_slurm and optuna come with pip install 'nerf_lightning[sweeps]'"
-    return InputError("command line", "", line, "what nerf_lightning train --help describes")
+    return InputError("command line", "", line, hint="see nerf_lightning train --help")

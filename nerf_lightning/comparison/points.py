@@ -175,5 +175,7 @@ def read_references(file: Path) -> pd.DataFrame:
                         raise ValueError(f"{name}: {psnr} dB, {seconds} s")
                     rows.append((str(name), psnr, seconds, str(scene), origin))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(file, "", f"{type(error).__name__}: {error}", REFERENCES_FORMAT) from error
+        raise InputError(
+            file, "", f"no references ({type(error).__name__}: {error})", hint=REFERENCES_FORMAT
+        ) from error
     return pd.DataFrame(rows, columns=["name", "psnr", "seconds", "scene", "origin"])

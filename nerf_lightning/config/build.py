@@ -56,7 +56,7 @@ def instantiate_node(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> 
     target, node = resolve_target(cfg, path), OmegaConf.select(cfg, path)
     missing = sorted(OmegaConf.missing_keys(node))
     if missing:
-        raise InputError("config", missing[0], "nothing", "a value", f"give {missing[0]}=...")
+        raise InputError("config", missing[0], "missing", hint=f"give {missing[0]}=...")
     is_partial = node.get("_partial_") or False
     check_options(path, target, get_options(node), extra, require_all=not is_partial)
     # Hydra, which resolves its input twice, only binds the options: it would turn dataclasses among `extra` into configs.
@@ -68,10 +68,12 @@ def instantiate_node(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> 
     except (ValueError, TypeError, MisconfigurationException) as error:
         if isinstance(error, InputError) or target.__module__.split(".")[0] == "nerf_lightning":
             raise  # our own targets raise InputError for bad options, so this is a defect
-        raise InputError("config", path, str(error), f"options that {target.__name__} takes") from error
+        raise InputError("config", path, f"{target.__name__} refuses its options: {error}") from error
     if kinds and not isinstance(result, kinds):
         expected = " or ".join(kind.__name__ for kind in kinds)
-        raise InputError("config", f"{path}._target_", f"what makes a {type(result).__name__}", f"a {expected}")
+        raise InputError(
+            "config", f"{path}._target_", f"what makes a {type(result).__name__}", f"what makes a {expected}"
+        )
     return result
 
 
@@ -106,7 +108,7 @@ def resolve_target(cfg: DictConfig, path: str) -> Any:
     try:
         return hydra.utils.get_object(node["_target_"])
     except (ImportError, AttributeError, ValueError, ConfigKeyError) as error:
-        raise InputError("config", f"{path}._target_", str(error), "an importable class or function") from error
+        raise InputError("config", f"{path}._target_", f"cannot be imported: {error}") from error
 
 
 def resolve_config(cfg: DictConfig) -> dict[str, Any]:
@@ -165,7 +167,7 @@ def build_system(cfg: DictConfig, metadata: "Metadata", device: torch.device = C
     try:
         optimizer([torch.zeros(1)])  # so that a negative rate is reported now, not when training starts
     except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:
-        raise InputError("config", "optimizer", str(error), f"options that {cfg.optimizer._target_} takes") from error
+        raise InputError("config", "optimizer", f"{cfg.optimizer._target_} refuses its options: {error}") from error
     chunk = get_limits(cfg, device).chunk_samples
     common = {"optimizer": optimizer, "schedule": instantiate_node(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
     common["compile_backend"] = COMPILE_BACKEND if cfg.compile else None

@@ -52,7 +52,7 @@ def find_masks(photos: Sequence[Path], root: Path) -> list[Path | None]:
     for photo, mask in zip(photos, found, strict=True):
         if mask is not None and (other := owners.setdefault(mask, photo)) != photo:
             text = f"one mask for {other.relative_to(common)} and {photo.relative_to(common)}"
-            raise InputError(mask, "", text, "a mask for each photo", "put masks into folders named as the photos'")
+            raise InputError(mask, "", text, hint="put masks into folders named as the photos'")
     missing = [photo.name for photo, mask in zip(photos, found, strict=True) if mask is None]
     if len(missing) == len(photos):
         log.warning("%s: no mask has the name of a photo, such as %s: masks left out", folder, photos[0].stem + ".png")
@@ -96,7 +96,7 @@ def match_mask(
     found = [path for mask, path in masks if fits(mask, True)] or [path for mask, path in masks if fits(mask, False)]
     if len(found) > 1:
         shown = join_truncated([path.relative_to(folder).as_posix() for path in found], MAX_NAMED)
-        raise InputError(folder, "", f"{len(found)} masks for {file.name}: {shown}", "one mask for each photo")
+        raise InputError(folder, "", f"{len(found)} masks for {file.name}: {shown}", hint="keep one")
     return found[0] if found else None
 
 

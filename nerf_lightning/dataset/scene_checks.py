@@ -64,8 +64,7 @@ def check_scene(scene: Scene, refines_poses: bool = False) -> list[SceneIssue]:
     for check in (check_content, check_cameras, check_background, check_silhouettes, check_duplicates, check_bounds):
         for doubt in check(scene):
             if doubt.is_fatal and not (refines_poses and doubt.is_refinable):
-                expected = "photos and poses that fit each other"
-                raise InputError(scene.source, "", doubt.text, expected, doubt.hint)
+                raise InputError(scene.source, "", doubt.text, hint=doubt.hint)
             doubts.append(doubt)
     return doubts
 

@@ -88,5 +88,5 @@ def check_visible_pixels(source: object, views: Views) -> None:
     """
     is_transparent = views.channels == 4 and not bool(views.pixels[:, 3].any())
     if is_transparent or (views.valid_mask is not None and not bool(views.valid_mask.any())):
-        found, expected = "alpha or masks that leave out all of the training photos", "photos that show something"
-        raise InputError(source, "", found, expected, "dataset.invert_masks=true?")
+        found = "alpha or masks leave out all of the training photos"
+        raise InputError(source, "", found, hint="dataset.invert_masks=true?")

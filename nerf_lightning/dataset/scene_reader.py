@@ -46,7 +46,7 @@ def open_scene(
     try:
         scene = _open(source, name, options)
     except OSError as error:  # a loop of links, a folder that may not be read
-        raise InputError(source, "", f"something unreadable ({error})", SUPPORTED_SOURCES) from error
+        raise InputError(source, "", f"cannot be read ({error})") from error
     if near is None and far is None:
         return scene
     bounds = scene.bounds
@@ -77,5 +77,5 @@ def _open(source: Path, name: str | None, options: PhotoLoadOptions) -> Scene:
         name = name or (source.stem if source.is_file() else source.resolve().name)
         return load_colmap(run_sfm(photos), name, replace(options, orientation="exif"), photos)
     kind = "folder" if source.is_dir() else f"{source.suffix or 'plain'} file"
-    found = f"a {kind} without a scene" if source.exists() else "nothing there"
-    raise InputError(source, "", found, SUPPORTED_SOURCES)
+    found = f"a {kind} without a scene" if source.exists() else "no such file or folder"
+    raise InputError(source, "", found, hint=f"give {SUPPORTED_SOURCES}")

@@ -104,6 +104,6 @@ def write_gallery(folder: Path, output: Path, build: Callable[[Path], tuple[str,
         label = ", ".join(f"{key} {run.get_option(key)}" for key in keys) or run.folder.name
         pages.append((relative_url(output.parent, page), label, run.psnr_text))
     if not pages:
-        raise InputError(folder, "", "no run that can be shown", "a folder of finished runs", "see what was left out")
+        raise InputError(folder, "", "no run can be shown", hint="see what was left out")
     write_text(output, render_gallery_page(folder.resolve().name, pages))
     return len(pages)

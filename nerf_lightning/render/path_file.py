@@ -53,8 +53,8 @@ def read_path(file: Path, orbit: Cameras, to_source: Float[Tensor, "4 4"], frame
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
-        expected = "width, height, K and c2w, or nerfstudio's camera_path, or instant-ngp's path"
-        raise InputError(file, "", f"{type(error).__name__}: {error}", expected) from error
+        expected = "give width, height, K and c2w, or nerfstudio's camera_path, or instant-ngp's path"
+        raise InputError(file, "", f"no camera path ({type(error).__name__}: {error})", hint=expected) from error
     taken = own if frame == "auto" else frame
     where = "the run's frame" if taken == "run" else "the world frame of the photos' own file"
     print(f"{file}: {kind} in {where} (--path-frame {'file' if taken == 'run' else 'run'} takes the other)")

@@ -93,7 +93,7 @@ def prepare_folder(folder: Path, manifest: dict[str, Any], is_owned: bool) -> No
         if is_owned:
             shutil.rmtree(folder)
         elif any(folder.iterdir()):
-            raise InputError(folder, "", "something else in it", "a folder for these frames alone", "give -o FOLDER")
+            raise InputError(folder, "", "holds other files", hint="give -o FOLDER")
 
 
 def read_frames(files: list[Path]) -> Iterator[Image]:

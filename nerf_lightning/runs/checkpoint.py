@@ -27,24 +27,23 @@ def read_checkpoint(path: Path, keys: Sequence[str] = RENDER_KEYS) -> dict[str, 
     Raises:
         InputError: the file is missing, truncated, changed since it was written, larger than memory, or no state.
     """
-    expected = "a whole checkpoint of tensors and plain values"
     require_file(path, "a checkpoint", "the run may have ended before its first one")
     try:
         with zipfile.ZipFile(path) as archive:
             check_memory(path, "", "a checkpoint", sum(part.file_size for part in archive.infolist()))
             damaged = archive.testzip()
         if damaged is not None:
-            raise InputError(path, damaged, "other bytes than were written", expected)
+            raise InputError(path, damaged, "damaged: its checksum differs", hint="copy it again")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # about kinds of files that are refused below
             state = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, *DAMAGE_ERRORS) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(path, "", str(error).split(".")[0], expected) from error
+        raise InputError(path, "", f"no checkpoint of tensors and plain values ({str(error).split('.')[0]})") from error
     missing = [key for key in keys if not isinstance(state, dict) or key not in state]
     if missing:
-        raise InputError(path, missing[0], "nothing", expected)
+        raise InputError(path, missing[0], "missing")
     return state
 
 
@@ -57,4 +56,4 @@ def check_finite(module: torch.nn.Module, where: object) -> None:
     for name, tensor in module.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             hint = "the run has broken down: see its results.json"
-            raise InputError(where, name, "nan or infinity", "weights that are finite numbers", hint)
+            raise InputError(where, name, "weights are not finite", hint=hint)

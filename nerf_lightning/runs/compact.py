@@ -115,8 +115,7 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> Load
     except InputError:
         raise
     except VALUE_ERRORS as error:
-        expected = "the weights of the model it names"
-        raise InputError(path, "", f"{type(error).__name__}: {error}", expected) from error
+        raise InputError(path, "", f"does not hold the model it names ({type(error).__name__}: {error})") from error
     check_finite(system, path)
     return LoadedRun(cfg, system.eval().to(device), orbit, to_source, header["scene"])
 

@@ -34,8 +34,8 @@ def find_run(path: str | os.PathLike[str] | None = None) -> Path:
         return root
     runs = [file.parent for file in root.rglob("config.yaml") if is_run(file.parent)]
     if not runs:
-        found = "a folder without a run" if root.is_dir() else "nothing there"
-        raise InputError(root, "", found, "a run: a folder with config.yaml and checkpoints/, or a compact file (.npz)")
+        found = "a folder without a run" if root.is_dir() else "no such file or folder"
+        raise InputError(root, "", found, hint="give a folder with config.yaml and checkpoints/, or a .npz file")
     return max(runs, key=lambda run: (run / LAST_CHECKPOINT).stat().st_mtime)
 
 

@@ -94,7 +94,7 @@ def parse_config(plain: Any, path: Path | str) -> DictConfig:
     try:
         return OmegaConf.create(escape_interpolations(plain))  # text from outside is never an interpolation
     except RecursionError as error:
-        raise InputError(path, "", "values nested too deep", "a run's configuration") from error
+        raise InputError(path, "", "values are nested too deep") from error
 
 
 def check_config(path: Path | str, key: str, node: Any) -> None:
@@ -166,6 +166,6 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device =
         weights = {key: value for key, value in state["state_dict"].items() if not key.startswith("corrections.")}
         system.load_state_dict(weights)
     except VALUE_ERRORS as error:
-        raise InputError(path, "state_dict", str(error), "the weights of this run's model") from error
+        raise InputError(path, "state_dict", f"not the weights of this run's model: {error}") from error
     check_finite(system, path)
     return LoadedRun(cfg, system.eval().to(device), orbit, to_source, scene)

@@ -40,15 +40,13 @@ def lock_folder(folder: Path) -> Iterator[None]:
         return
     folder.mkdir(parents=True, exist_ok=True)
     if not (is_empty(folder) or has_run_outputs(folder) or (folder / RUN_MARKER).exists()):
-        raise InputError(folder, "", "other files in it", "a new or empty folder, or that of an earlier run")
+        raise InputError(folder, "", "holds other files", hint="give a new or empty folder, or that of an earlier run")
     lock = FileLock(folder / LOCK_FILE, timeout=0)
     try:
         lock.acquire()
     except Timeout as error:
         hint = "wait for its end, or give another folder"
-        raise RunFolderInUse(
-            folder, "", "a run that is in progress", "a folder that no other process uses", hint
-        ) from error
+        raise RunFolderInUse(folder, "", "a run is in progress in it", hint=hint) from error
     if is_empty(folder):
         (folder / RUN_MARKER).touch()
     try:
@@ -92,7 +90,7 @@ def lock_new_run_folder(folder: Path, overwrite: bool, allow_suffix: bool = Fals
 def make_run_exists_error(folder: Path) -> RunFolderInUse:
     """The error for a folder that holds a run."""
     hint = f"resume={folder} continues it, overwrite=true replaces it"
-    return RunFolderInUse(folder, "", "a run in it already", "a folder of its own for each run", hint)
+    return RunFolderInUse(folder, "", "holds a run already", hint=hint)
 
 
 def has_run_outputs(folder: Path) -> bool:

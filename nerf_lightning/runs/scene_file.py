@@ -95,7 +95,7 @@ def parse_metadata(scene: Mapping[str, Any], where: object) -> tuple[Metadata, C
         frame = SceneMetadata(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel), (red, green, blue))
         return frame, parse_cameras(where, "orbit.", scene["orbit"]), torch.from_numpy(to_source)
     except (LookupError, TypeError) as error:
-        raise InputError(where, "", f"{type(error).__name__}: {error}", EXPECTED_CONTENT) from error
+        raise InputError(where, "", f"damaged ({type(error).__name__}: {error})") from error
 
 
 def parse_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:

@@ -73,7 +73,7 @@ def read_run(folder: Path) -> RunSummary:
     try:
         results = read_json(folder / "results.json", "figures", "train it again")
     except InputError as error:
-        return RunSummary(folder, plain, {}, "unreadable", f"results.json: found {error.found}")
+        return RunSummary(folder, plain, {}, "unreadable", f"results.json: {error.problem}")
     if not isinstance(results, dict):
         return RunSummary(folder, plain, {}, "unreadable", f"results.json: a {type(results).__name__}, not a mapping")
     diagnosis = str(results.get("diagnosis") or "")
@@ -87,10 +87,10 @@ def find_runs(root: Path) -> list[RunSummary]:
         InputError: where there is no such folder, or no run in it.
     """
     if not root.is_dir():
-        raise InputError(root, "", "no such folder", "a folder of runs", "look below outputs/")
+        raise InputError(root, "", "no such folder", hint="look below outputs/")
     folders = {path.parent for name in ("results.json", "config.yaml") for path in root.rglob(name)}
     if not folders:
-        raise InputError(root, "", "no run in it", "folders with a config.yaml and a results.json")
+        raise InputError(root, "", "no run in it: no config.yaml or results.json")
     return [read_run(folder) for folder in sorted(folders)]
 
 

@@ -11,8 +11,8 @@ from nerf_lightning.utils.files import expand_user_path
 from nerf_lightning.utils.parsing import read_yaml
 
 Options = dict[str, Any]
-MIN_GAIN_RATIO = 3.0
-"""A rung pays where it gains a `MIN_GAIN_RATIO`th of what the choice may be below the best, for twice the bytes."""
+GAIN_DIVISOR = 3.0
+"""A rung pays where it gains a `GAIN_DIVISOR`th of what the choice may be below the best, for twice the bytes."""
 MAX_RUNGS_WITHOUT_GAIN = 2
 """Rungs in a row that are not worth their bytes, after which growing stops: one may be chance."""
 FULL_TRAINING_GAIN_DB = 1.0
@@ -79,7 +79,7 @@ def is_growth_finished(rungs: Sequence[RungResult], target: Target) -> bool:
         return False
     # The best before counts, not the last: two rungs that fall and rise again have gained nothing.
     base = max(rungs[:-MAX_RUNGS_WITHOUT_GAIN], key=lambda one: one.psnr)
-    each = target.within_db / MIN_GAIN_RATIO
+    each = target.within_db / GAIN_DIVISOR
     return all(
         one.psnr - base.psnr <= each * max(math.log2(one.size / base.size), 1.0)
         for one in rungs[-MAX_RUNGS_WITHOUT_GAIN:]

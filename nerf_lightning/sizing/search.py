@@ -131,8 +131,8 @@ def start_or_resume(output: Path, cfg: DictConfig, target: Target, ladder: Ladde
     if is_empty(output):
         write_json(output / PLAN_FILE, plan)
     elif not (output / PLAN_FILE).is_file() or read_json(output / PLAN_FILE, "a plan") != json.loads(json.dumps(plan)):
-        found, expected = "something else in it", "a folder for this search alone"
-        raise InputError(output, "", found, expected, "give another --output, or the same options to continue")
+        hint = "give another --output, or the same options to continue"
+        raise InputError(output, "", "holds something else", hint=hint)
 
 
 def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
@@ -215,7 +215,7 @@ def measure_psnr(system: System, data: DataModule) -> float:
     """
     found = measure_held_out_psnr(system, data, subsample(data.num_held_out_views, NUM_VIEWS))
     if not math.isfinite(found):
-        raise InputError("rightsize", "", "images that are not finite", "a field that learns", "lower optimizer.lr")
+        raise InputError("rightsize", "", "rendered images are not finite", hint="lower optimizer.lr")
     return found
 
 

@@ -74,8 +74,8 @@ def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Generator[T
             yield running.popleft().result()
             running.extend(pool.submit(run_trial, trial, root) for trial in islice(rest, 1))
     except TerminatedWorkerError as error:
-        found, expected = "a process that the system ended", f"memory for {workers} of them"
-        raise InputError("stability", "workers", found, expected, "give fewer; the same command continues") from error
+        found = f"the system ended one of {workers} processes, as when memory is short"
+        raise InputError("stability", "workers", found, hint="give fewer; the same command continues") from error
     finally:
         pool.shutdown(kill_workers=True)
 

@@ -90,7 +90,6 @@ def check_compiler(device: torch.device, backend: str) -> None:
         raise InputError(
             "config",
             "compile",
-            f"true, but {str(error).strip().splitlines()[0]}",
-            needed,
-            "install it (g++ or clang++; Triton and gcc for CUDA), or give compile=false",
+            f"{needed} is missing ({str(error).strip().splitlines()[0]})",
+            hint="install it (g++ or clang++; Triton and gcc for CUDA), or give compile=false",
         ) from error

@@ -27,7 +27,7 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
         if key == "resume":
             continue
         if OmegaConf.select(saved, key, default=key) is key:
-            raise InputError("resume", key, "an option the run does not have", f"one of those in {folder}/config.yaml")
+            raise InputError("resume", key, "the run has no such option", hint=f"see {folder}/config.yaml")
         value = OmegaConf.select(cfg, key)
         OmegaConf.update(
             saved,

@@ -180,8 +180,8 @@ def fit(run: TrainingRun, checkpoint: Path | None) -> None:
             delete_run_outputs(run.folder)
         if checkpoint is None or run.system.state.clock.has_started or isinstance(error, InputError):
             raise
-        found = f"{type(error).__name__}: {error}"  # nothing but the checkpoint was read yet
-        raise InputError(checkpoint, "", found, "a state of this run to continue from", "start the run anew") from error
+        problem = f"cannot be resumed ({type(error).__name__}: {error})"  # nothing but the checkpoint was read yet
+        raise InputError(checkpoint, "", problem, hint="start the run anew") from error
 
 
 def has_trained(trainer: L.Trainer, error: BaseException) -> bool:

@@ -89,9 +89,7 @@ def is_disk_full(error: BaseException | None) -> bool:
 
 def disk_full_error(where: object) -> DiskFullError:
     """The error for a full disk."""
-    return DiskFullError(
-        where, "", "no space left on the device", "space for it", "free some and continue: nothing was lost"
-    )
+    return DiskFullError(where, "", "no space left on the device", hint="free some and continue: nothing was lost")
 
 
 def write_text(path: Path, text: str) -> None:
@@ -128,8 +126,8 @@ def check_output_path(text: str | os.PathLike[str]) -> Path:
     path = expand_user_path(text)
     folder = path.absolute() if path.is_dir() else next(p for p in path.absolute().parents if os.path.lexists(p))
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        found = f"{folder}, which {'may not be written' if folder.is_dir() else 'is a file'}"
-        raise InputError(path, "", found, "a folder to write into", "give another one")
+        found = f"{folder} {'may not be written' if folder.is_dir() else 'is a file'}"
+        raise InputError(path, "", found, hint="give another folder")
     return path
 
 

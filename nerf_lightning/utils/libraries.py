@@ -30,7 +30,7 @@ def require_extra(extra: str, *packages: str, purpose: str, hint: str = "") -> N
             if error.name != package:
                 raise
             hint = f"pip install 'nerf_lightning[{extra}]'{hint}"
-            raise InputError(package, "", "no such package", purpose, hint) from error
+            raise InputError(package, "", f"not installed: {purpose}", hint=hint) from error
 
 
 def silence_lightning() -> None:

@@ -55,7 +55,7 @@ def check_memory(
     free = free_memory(device)
     if not size <= free:
         found, there = (f"{part / 2**30:,.1f} GiB" for part in (size, free))
-        raise InputError(where, key, f"{item} that take at least {found}", f"at most the {there} that are free", hint)
+        raise InputError(where, key, f"{item} need at least {found}, and {there} are free", hint=hint)
 
 
 def out_of_memory_error(error: BaseException) -> InputError | None:
@@ -65,7 +65,7 @@ def out_of_memory_error(error: BaseException) -> InputError | None:
     size = re.search(r"allocate ([\d.]+ \w+)", str(error))
     less = "dataset.rays, dataset.samples, dataset.pixels, limits.batch_scale or limits.chunk_samples"
     found = f"no memory for {size[1] if size else 'a tensor'}"
-    return InputError("memory", "", found, "what fits into it", f"give less of {less}, or a smaller model")
+    return InputError("memory", "", found, hint=f"give less of {less}, or a smaller model")
 
 
 def keep_freed_memory() -> None:

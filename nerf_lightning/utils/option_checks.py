@@ -88,8 +88,8 @@ def check_options(
         kinds = (inspect.Parameter.POSITIONAL_OR_KEYWORD, inspect.Parameter.KEYWORD_ONLY)
         required = parameter.default is inspect.Parameter.empty and parameter.kind in kinds
         if require_all and required and name not in options and name not in bound_arguments:
-            expected, hint = _describe_type(hints.get(name, Any)), f"give {prefix}{name}=..."
-            raise InputError(source, prefix + name, "nothing", expected, hint)
+            hint = f"give {prefix}{name}=, {_describe_type(hints.get(name, Any))}"
+            raise InputError(source, prefix + name, "missing", hint=hint)
 
 
 def _matches_type(value: Any, annotation: Any) -> bool:

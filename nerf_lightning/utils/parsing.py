@@ -34,7 +34,7 @@ def require_file(path: Path, expected: str = "a file", missing_hint: str = "chec
     if path.is_dir():
         raise InputError(path, "", "a folder", expected)
     if not path.is_file():
-        raise InputError(path, "", "nothing there", expected, missing_hint)
+        raise InputError(path, "", "no such file", hint=missing_hint)
     return path
 
 
@@ -49,7 +49,7 @@ def read_file(path: Path, expected: str = "a file that can be read", memory_per_
         check_memory(path, "", "content", path.stat().st_size * memory_per_byte)
         return path.read_bytes()
     except OSError as error:
-        raise InputError(path, "", f"something unreadable ({error})", expected) from error
+        raise InputError(path, "", f"cannot be read ({error})") from error
 
 
 def read_json(path: Path, expected: str, hint: str = "export it again") -> Any:
@@ -70,7 +70,7 @@ def parse_json(content: bytes, where: object, expected: str, hint: str = "") -> 
     try:
         return json.loads(content.decode(json.detect_encoding(content)))
     except (RecursionError, ValueError, MemoryError) as error:
-        raise InputError(where, "", f"broken JSON ({type(error).__name__}: {error})", expected, hint) from error
+        raise InputError(where, "", f"unreadable as {expected} ({type(error).__name__}: {error})", hint=hint) from error
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -96,7 +96,7 @@ def read_yaml(path: Path, expected: str, hint: str = "") -> Any:
     try:
         return yaml.load(content.decode("utf-8-sig"), _PlainLoader)  # noqa: S506  (a SafeLoader)
     except (yaml.YAMLError, *VALUE_ERRORS) as error:  # Python's own for a date or a number that is none
-        raise InputError(path, "", f"no YAML ({type(error).__name__}: {error})", expected, hint) from error
+        raise InputError(path, "", f"unreadable as {expected} ({type(error).__name__}: {error})", hint=hint) from error
 
 
 def read_npz(
@@ -149,5 +149,5 @@ def _damage_as_input_error(where: object, expected: str) -> Iterator[None]:
     except InputError:
         raise
     except DAMAGE_ERRORS as error:
-        found = f"something unreadable ({type(error).__name__}: {error})"
-        raise InputError(where, "", found, expected, "save or copy it again") from error
+        found = f"unreadable as {expected} ({type(error).__name__}: {error})"
+        raise InputError(where, "", found, hint="save or copy it again") from error

@@ -52,7 +52,7 @@ def test_solve_without_outliers_excludes_unlinked_photos():
         if photo.residuals:
             squares = np.concatenate(list(photo.residuals.values())) ** 2
             assert photo.reprojection_px == pytest.approx(np.sqrt(squares.sum(1).mean()))
-    with pytest.raises(InputError, match="tags that fit no camera"):
+    with pytest.raises(InputError, match="the tags fit no camera"):
         solve_poses(LENS, [seen[1]], None)
 
 

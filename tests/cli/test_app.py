@@ -43,8 +43,8 @@ def test_help_lists_commands_in_workflow_order_and_quick_start(run_cli):
         (["evaluate", "--worst", "x"], "--worst"),
         (["evaluate", "--worst", "0"], "worst: found 0, expected a whole number at least 1"),
         (["evaluate", "--split", "all"], "val"),
-        (["evaluate", "nowhere (1), ü=2"], "nowhere (1), ü=2: found nothing there"),
-        (["evaluate"], "outputs: found nothing there"),
+        (["evaluate", "nowhere (1), ü=2"], "nowhere (1), ü=2: no such file or folder"),
+        (["evaluate"], "outputs: no such file or folder"),
     ],
 )
 def test_main_wrong_arguments_exit_with_code_2(arguments: list[str], words: str, run_cli):

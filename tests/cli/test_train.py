@@ -38,11 +38,11 @@ ROOT = Path(__file__).resolve().parents[2]
         (["schedule=null"], ["schedule: found null", "one of constant, cosine, exponential"]),
         (["sampler=null"], ["sampler: found nothing", "the group sampler"]),
         (["renderer.background=pink"], ["renderer.background", "'pink'", "black, white"]),
-        (["dataset=photos", "dataset.path=missing.npz"], ["missing.npz", "nothing there", "check the path"]),
-        (["dataset=photos", "dataset.path=broken.npz"], ["broken.npz", "expected plain numeric arrays"]),
-        (["resume=notes.txt"], ["notes.txt: found no folder, expected the folder of a run"]),
+        (["dataset=photos", "dataset.path=missing.npz"], ["missing.npz", "no such file", "check the path"]),
+        (["dataset=photos", "dataset.path=broken.npz"], ["broken.npz", "unreadable as plain numeric arrays"]),
+        (["resume=notes.txt"], ["notes.txt: no such folder; give resume=FOLDER"]),
         (["+experiment=broken.yaml"], ["broken.yaml", "YAML"]),
-        (["hydra.run.dir=notes.txt/below"], ["notes.txt/below: found Not a directory"]),
+        (["hydra.run.dir=notes.txt/below"], ["notes.txt/below: Not a directory"]),
     ],
 )
 def test_train_bad_input_exits_with_code_2(arguments: list[str], words: list[str], run_cli, tmp_path: Path):
@@ -140,7 +140,7 @@ def test_resume_accepts_overrides_and_rejects_unknown_keys(run_cli, tmp_path: Pa
     assert "sampler.samples" in err
     before = {name: (run / name).read_bytes() for name in ("config.yaml", "scene.json", "results.json")}
     code, _, err = run_cli(f"resume={run}", "model.width=24")
-    assert code == 2 and "last.ckpt: found " in err and err.count("\n") == 1
+    assert code == 2 and "last.ckpt: " in err and err.count("\n") == 1
     assert {name: (run / name).read_bytes() for name in before} == before, "the run stays as it was"
 
 
@@ -152,7 +152,7 @@ def test_train_existing_run_requires_overwrite(run_cli, tmp_path: Path):
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
     again = [*small, "budget.steps=3", "callbacks.snapshots.steps=[1]", "hydra.run.dir=mine"]
     code, _, err = run_cli(*again)
-    assert code == 2 and err.count("\n") == 1 and "mine: found a run in it already" in err and "overwrite=true" in err
+    assert code == 2 and err.count("\n") == 1 and "mine: holds a run already" in err and "overwrite=true" in err
     code, _, err = run_cli(*again, "overwrite=true", "callbacks.snapshots.view=7")
     assert code == 2, "another reason"
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before, "removed once the new run is sound"
@@ -165,7 +165,7 @@ def test_train_existing_run_requires_overwrite(run_cli, tmp_path: Path):
     assert "overwrite" not in (folder / "config.yaml").read_text()
     with lock_folder(folder):
         code, _, err = run_cli(f"resume={folder}")
-    assert code == 2 and "a run that is in progress" in err and err.count("\n") == 1
+    assert code == 2 and "a run is in progress" in err and err.count("\n") == 1
 
 
 def test_train_null_groups_are_left_out(run_cli, tmp_path: Path):

@@ -81,7 +81,7 @@ def test_error_sampler_state_resumes_exactly():
         assert all(map(torch.equal, other.draw(300, make_generator(step)), (pixels, weights)))
         whole.update(errors[pixels])
         order = torch.randperm(300)  # sums do not depend on it
-        other.drawn = other.drawn[order]
+        other.last_tiles = other.last_tiles[order]
         other.update(errors[pixels][order])
     assert all(map(torch.equal, whole.state_dict().values(), other.state_dict().values()))
 

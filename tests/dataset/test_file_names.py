@@ -48,7 +48,7 @@ def test_find_images_name_means_the_one_file(tmp_path: Path):
 def test_find_images_folders_decide(tmp_path: Path):
     root = make_files(tmp_path, "images/front/0.png", "images/back/0.png")
     assert find(root, "/data/Front/0.PNG") == [root / "images/front/0.png"]
-    with pytest.raises(InputError, match=r"'0\.jpg', which may mean 2 files: images/back/0\.png, images/front"):
+    with pytest.raises(InputError, match=r"'0\.jpg' may mean 2 files: images/back/0\.png, images/front"):
         find(root, "0.jpg")
 
 
@@ -58,5 +58,5 @@ def test_find_images_file_has_one_name(tmp_path: Path):
     file = root / "train/1.png"
     assert find(root, "test/1.png", "train/1.png") == [None, file]
     assert find(root, "/data/test/1.png", "/data/train/1.png") == [None, file]
-    with pytest.raises(InputError, match="'a/1.png' and 'b/1.png', of which only"):
+    with pytest.raises(InputError, match="'a/1.png' and 'b/1.png' both match"):
         find(root, "a/1.png", "b/1.png")

@@ -85,5 +85,5 @@ def test_read_pixels_heic_is_upright(tmp_path: Path):
 def test_read_pixels_heic_without_package_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "a.heic").write_bytes(b"\0\0\0\x1cftypheic" + bytes(100))
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(InputError, match=r"no such package, .* HEIC photos; pip install 'nerf_lightning\[heic\]'"):
+    with pytest.raises(InputError, match=r"not installed: .* HEIC photos; pip install 'nerf_lightning\[heic\]'"):
         read_pixels(tmp_path / "a.heic")

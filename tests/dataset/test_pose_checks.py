@@ -202,9 +202,9 @@ def test_find_pairs_matches_show_the_same_point(forward: Scene):
     off = []
     views, cameras = forward.train, forward.train.cameras
     for pair in find_pairs([detect_features(views, view) for view in range(len(views))], cameras)[:6]:
-        column, row = torch.from_numpy(pair.places[:, 0]).long().unbind(1)
+        column, row = torch.from_numpy(pair.keypoints[:, 0]).long().unbind(1)
         rays = cameras.generate_rays(torch.full_like(column, pair.first), row, column)
-        points = rays.origins + rays.directions * trace_rays(ROOMS["filling subject"].bodies, rays)[1][:, None]
+        points = rays.origins + rays.directions * trace_rays(ROOMS["filling subject"].primitives, rays)[1][:, None]
         places = cameras.project(points, pair.second)[0].numpy()
-        off.append(np.linalg.norm(places - pair.places[:, 1], axis=1))
+        off.append(np.linalg.norm(places - pair.keypoints[:, 1], axis=1))
     assert np.median(np.concatenate(off)) < 1.5

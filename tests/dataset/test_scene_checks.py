@@ -79,7 +79,7 @@ def test_check_scene_without_matches_judges_outlines(pile: Scene):
 def test_check_scene_cameras_looking_away_are_doubted(pile: Scene):
     away = flip_axes(replace(pile, bounds=Bounds(pile.bounds.aabb, unbounded=True)), 0)
     (doubt,) = check_scene(away)
-    assert "cameras with their backs to the point" in doubt.text and not doubt.hopeless
+    assert "cameras with their backs to the point" in doubt.text and not doubt.is_fatal
 
 
 def black(scene: Scene) -> Scene:

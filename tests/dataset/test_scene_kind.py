@@ -106,6 +106,6 @@ def test_open_scene_options_reach_every_format(format: str, ball_views: Views, t
 def test_open_scene_unknown_path_raises(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     (tmp_path / "a.txt").write_text("")
-    for name, found in (("absent", "nothing there"), ("empty", "a folder without"), ("a.txt", "a .txt file without")):
-        with pytest.raises(InputError, match=f"{tmp_path / name}: found {found}.*, expected photos or a video"):
+    for name, found in (("absent", "no such file"), ("empty", "a folder without"), ("a.txt", "a .txt file without")):
+        with pytest.raises(InputError, match=f"{tmp_path / name}: {found}.*; give photos or a video"):
             open_scene(str(tmp_path / name))

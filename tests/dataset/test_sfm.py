@@ -47,7 +47,7 @@ def placed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[pyco
     """What COLMAP makes of copies that are smaller than the photos, and where it worked."""
     workspace = tmp_path_factory.mktemp("workspace")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(colmap, "COPY_SIDE", 390)
+        patched.setattr(colmap, "COPY_SIDE_PX", 390)
         model = colmap.reconstruct(find_photos(photos, ""), workspace)
     assert model is not None
     return model, workspace

@@ -91,7 +91,7 @@ def test_export_writes_format_of_suffix(planes: Path, tmp_path: Path):
     assert mesh.read_bytes()[:4] == b"glTF" and points.read_bytes()[:3] == b"ply" and voxels.read_bytes()[:2] == b"PK"
     posed = export_transforms(planes, output=tmp_path / "posed")
     assert len(json.loads((posed / "transforms.json").read_text())["frames"]) == 9
-    with pytest.raises(InputError, match="posed: found something"):
+    with pytest.raises(InputError, match="posed: exists already"):
         export_transforms(planes, output=posed)
 
 

@@ -78,14 +78,14 @@ def test_tensorf_large_photos_enlarge_planes_and_network(unbounded: bool, across
 
 
 def test_run_on_large_photos_has_finer_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
+    monkeypatch.setattr(bounds, "REFERENCE_WIDTH_PX", 4)  # so that small photos count as large
     monkeypatch.setattr(planes, "MIN_STEPS_PER_STAGE", 2)
-    monkeypatch.setattr(planes, "FINEST", 24)
+    monkeypatch.setattr(planes, "DEFAULT_MAX_RESOLUTION", 24)
     save_npz(make_object_scene(MARBLE, size=24, views=5, held_out=1), tmp_path / "scene.npz")
     given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "model.base_resolution=8"]
     given += ["model.size=fixed", "model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "~logger"]
     told: list[float] = []
-    monkeypatch.setattr(RayDataModule, "note_samples", lambda data, drawn: told.append(data._resolution_scale))
+    monkeypatch.setattr(RayDataModule, "adapt_num_rays", lambda data, drawn: told.append(data._resolution_scale))
     train(
         compose_config(
             [*given, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "budget.steps=7"], tmp_path / "run"

@@ -230,7 +230,7 @@ def test_train_with_corrections_reports_and_exports_poses(tmp_path: Path, capsys
             transform_poses(expected_views.cameras.c2w, again[0].to_source),
         )
         assert torch.equal(found.pixels, expected_views.pixels)
-    with pytest.raises(InputError, match="posed: found something, expected a folder that is not there yet"):
+    with pytest.raises(InputError, match="posed: exists already; give another"):
         export_transforms(tmp_path)
     with pytest.raises(InputError, match=r"corrected: found shape"):
         reload_data(load_config(tmp_path), {**read_scene_file(tmp_path), "corrected": [1.0]})

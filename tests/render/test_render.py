@@ -54,12 +54,12 @@ def test_render_test_path_shows_photos_beside_renders(run: Path, tmp_path: Path)
 def test_render_compact_file_and_the_same_command_reuses_frames(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    compact, frames = export_compact(run, loss_db=9), tmp_path / "frames"
+    compact, frames = export_compact(run, max_psnr_drop=9), tmp_path / "frames"
     for there in ("cpu", "2 of them there already"):
         render(compact, frames=2, background="transparent", output=frames)
         assert there in capsys.readouterr().out
     assert imageio.imread(frames / "00001.png").shape == (16, 16, 4)
-    with pytest.raises(InputError, match="something else in it"):
+    with pytest.raises(InputError, match="holds other files"):
         render(compact, frames=2, background="white", output=frames)
 
 

@@ -63,5 +63,5 @@ def test_write_video_folder_keeps_its_frames(tmp_path: Path):
     names = sorted(path.name for path in (tmp_path / "frames").iterdir())
     assert names == ["00000.png", "00001.png", "00002.png", "frames.json"]
     assert write_video({"what": 1}, plain, 3, tmp_path / "frames", fps=10) == 3
-    with pytest.raises(InputError, match="something else in it"):
+    with pytest.raises(InputError, match="holds other files"):
         write_video({"what": 2}, plain, 3, tmp_path / "frames", fps=10)

@@ -121,25 +121,25 @@ def save(make: Callable[[Path], object]) -> Callable[[Path], object]:
 
 CONFIG, SCENE, CHECKPOINT = "config.yaml", "scene.json", "checkpoints/last.ckpt"
 DAMAGES: list[tuple[str, Callable[[Path], object], str]] = [
-    (CONFIG, Path.unlink, "nothing there"),
-    (CONFIG, cut_before_schedule, "nothing"),
-    (CONFIG, lambda path: path.write_text(f"!!python/object/apply:os.mkdir ['{path.parent}/run']"), "no YAML"),
+    (CONFIG, Path.unlink, "no such file"),
+    (CONFIG, cut_before_schedule, "missing"),
+    (CONFIG, lambda path: path.write_text(f"!!python/object/apply:os.mkdir ['{path.parent}/run']"), "unreadable as"),
     (CONFIG, change(version="9.9"), "version 9.9"),
     (CONFIG, change(dataset="lego"), "options by name"),
     (CONFIG, change(model__finest=functools.reduce(lambda x, _: [x], range(150), 1)), "nested too deep"),
     (CONFIG, change(model__hue=3), "unknown option"),
-    (SCENE, Path.unlink, "nothing there"),
-    (SCENE, cut, "broken JSON"),
+    (SCENE, Path.unlink, "no such file"),
+    (SCENE, cut, "unreadable as"),
     (SCENE, change(orbit=None), "KeyError"),
     (SCENE, change(orbit__width=10**6, orbit__height=10**6), "pixels"),
     (SCENE, change(aabb=[[0, 0, 0], [1, 1, float("nan")]]), "nan"),
-    (CHECKPOINT, Path.unlink, "nothing there"),
-    (CHECKPOINT, cut, "whole checkpoint"),
-    (CHECKPOINT, flip_bit, "other bytes"),
-    (CHECKPOINT, save(lambda path: {"state_dict": Payload(path.parent / "run")}), "whole checkpoint"),
+    (CHECKPOINT, Path.unlink, "no such file"),
+    (CHECKPOINT, cut, "no checkpoint"),
+    (CHECKPOINT, flip_bit, "its checksum differs"),
+    (CHECKPOINT, save(lambda path: {"state_dict": Payload(path.parent / "run")}), "no checkpoint"),
     (CHECKPOINT, save(lambda path: {"state_dict": {}}), "state_dict"),
     (CHECKPOINT, lambda path: change(model__width=128)(path.parents[1] / CONFIG), "this run's model"),
-    (CHECKPOINT, with_nan, "nan or infinity"),
+    (CHECKPOINT, with_nan, "not finite"),
 ]
 
 
@@ -170,5 +170,5 @@ def test_resume_checkpoint_of_other_run_raises(small_run: Path, run_cli, tmp_pat
     torch.save(state, folder / CHECKPOINT)
     before = {path: path.read_bytes() for path in folder.glob("*.json")}
     code, _, err = run_cli(f"resume={folder}", "budget.steps=12")
-    assert code == 2 and err.count("\n") == 1 and "a state of this run to continue from" in err, err
+    assert code == 2 and err.count("\n") == 1 and "cannot be resumed" in err, err
     assert {path: path.read_bytes() for path in folder.glob("*.json")} == before

@@ -57,7 +57,7 @@ def test_reload_data_downloaded_scene_from_any_folder(published: Path, tmp_path:
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert (again(run).name, again(run).sha256()) == ("published", again(run, str(published)).sha256())
     published.unlink()
-    with pytest.raises(InputError, match=r"data/published\.npz.*nothing there"):
+    with pytest.raises(InputError, match=r"data/published\.npz.*no such file"):
         again(run)
 
 

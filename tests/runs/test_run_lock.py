@@ -42,7 +42,7 @@ def test_lock_new_run_folder_concurrent_runs_get_separate_folders(allow_suffix: 
     assert len(set(names)) == len(names) == (MANY if allow_suffix else 1)
     assert all("a run that is in progress" in line for line in set(found) - set(names))
     with (
-        pytest.raises(RunFolderInUse, match="found a run in it already"),
+        pytest.raises(RunFolderInUse, match="holds a run already"),
         lock_new_run_folder(tmp_path / "run", overwrite=False),
     ):
         pass
@@ -62,7 +62,7 @@ def test_lock_folder_removes_empty_folder(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_lock_folder_foreign_files_raise(tmp_path: Path):
     (tmp_path / "file").touch()
-    with pytest.raises(InputError, match="other files in it"), lock_folder(tmp_path):
+    with pytest.raises(InputError, match="holds other files"), lock_folder(tmp_path):
         pass
     (tmp_path / "config.yaml").touch()
     for overwrite in (False, True):  # a run that somebody moved here, or no run at all

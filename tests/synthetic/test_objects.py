@@ -56,7 +56,7 @@ def test_make_room_scene_is_photographed_from_ring_around_subject():
     scene = make_room_scene(room, 0, size=16, views=8, held_out=2)
     eyes = torch.cat([scene.train.cameras.centres, scene.val.cameras.centres])
     assert ((eyes.norm(dim=1) - 1).abs() < 0.4).all() and (eyes[:, 2] > 0).all() and scene.bounds.unbounded
-    _, distance, body = trace_rays(room.bodies, scene.train.cameras.generate_view_rays(0))
+    _, distance, body = trace_rays(room.primitives, scene.train.cameras.generate_view_rays(0))
     assert distance.isfinite().all() and 0 < float((body < room.num_subject_primitives).float().mean()) < 0.1
     other = make_room_scene(room, 1, size=16, views=8, held_out=2)
     assert not torch.equal(scene.train.cameras.c2w, other.train.cameras.c2w)

@@ -48,7 +48,7 @@ def test_atomic_write_full_disk_raises_and_keeps_file(tmp_path: Path):
     path.write_text("old")
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (5000, hard))
-        with pytest.raises(DiskFullError, match="a.ckpt: found no space left"):
+        with pytest.raises(DiskFullError, match="a.ckpt: no space left"):
             AtomicCheckpointIO().save_checkpoint({"weights": torch.zeros(5000)}, path)
         with pytest.raises(DiskFullError), atomic_write_folder(tmp_path / "b") as folder:
             (folder / "c").write_bytes(bytes(9000))

@@ -17,7 +17,7 @@ def test_check_memory_more_than_free_raises():
     free = free_memory()
     assert 0 < free < 2**50
     check_memory("config", "model", "numbers", 0.5 * free)
-    with pytest.raises(InputError, match="model: found numbers that take at least"):
+    with pytest.raises(InputError, match="model: numbers need at least"):
         check_memory("config", "model", "numbers", 2**50)
 
 
@@ -26,7 +26,7 @@ def test_prepare_system_field_larger_than_memory_raises(tmp_path, monkeypatch: p
     data = RayDataModule(make_object_scene(MARBLE, size=4, views=3, held_out=1))
     needed = prepare_system(cfg, data, CPU, False).field.training_bytes
     monkeypatch.setattr(psutil, "virtual_memory", lambda: type("Memory", (), {"available": needed // 2}))
-    with pytest.raises(InputError, match="config: model: found numbers"):
+    with pytest.raises(InputError, match="config: model: numbers"):
         prepare_system(cfg, data, CPU, False)
 
 
@@ -36,5 +36,5 @@ def test_out_of_memory_error_names_the_size():
         "20.00 GiB": torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has a total"),
         "a tensor": MemoryError(),
     }
-    assert all(f"no memory for {size}," in str(out_of_memory_error(error)) for size, error in errors.items())
+    assert all(f"no memory for {size};" in str(out_of_memory_error(error)) for size, error in errors.items())
     assert out_of_memory_error(RuntimeError("shapes differ")) is None

@@ -27,14 +27,14 @@ ALIASES = "a: &a [1, 1, 1, 1, 1]\n" + "".join(
         (ALIASES, "alias"),
         ("[" * 5000, "RecursionError"),
         ("x" * (MAX_YAML_BYTES + 1), "bytes"),
-        ("a: " + "9" * 5000, "no YAML"),
-        ("a: [1", "no YAML"),
-        ("!!python/object/apply:os.getcwd []", "no YAML"),
+        ("a: " + "9" * 5000, "unreadable as"),
+        ("a: [1", "unreadable as"),
+        ("!!python/object/apply:os.getcwd []", "unreadable as"),
     ],
 )
 def test_read_yaml_malformed_raises_one_line(text: str, found: str, tmp_path: Path):
     (tmp_path / "a.yaml").write_text(text, encoding="utf-8", errors="surrogateescape")
-    with pytest.raises(InputError, match=r"a\.yaml: found .*, expected options") as caught:
+    with pytest.raises(InputError, match=r"a\.yaml: .*options") as caught:
         read_yaml(tmp_path / "a.yaml", "options")
     assert found in str(caught.value) and "\n" not in str(caught.value)
 
@@ -55,7 +55,7 @@ def test_read_yaml_plain_values_are_read(tmp_path: Path):
 )
 def test_read_json_malformed_raises_one_line(text: str, found: str, tmp_path: Path):
     (tmp_path / "a.json").write_text(text, encoding="utf-8", errors="surrogateescape")
-    with pytest.raises(InputError, match=r"a\.json: found .*, expected figures; export it again") as caught:
+    with pytest.raises(InputError, match=r"a\.json: unreadable as figures .*; export it again") as caught:
         read_json(tmp_path / "a.json", "figures")
     assert found in str(caught.value)
 
@@ -68,8 +68,8 @@ def test_read_json_any_utf_is_read(encoding: str, tmp_path: Path):
 
 def test_read_json_pipe_or_folder_raises_at_once(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe")
-    for name, found in (("pipe", "nothing there"), ("", "a folder")):
-        with pytest.raises(InputError, match=f"found {found}"):
+    for name, found in (("pipe", "no such file"), ("", "found a folder")):
+        with pytest.raises(InputError, match=found):
             read_json(tmp_path / name, "figures")
 
 
@@ -101,7 +101,7 @@ def test_read_npz_other_arrays_stay_unread():
 @pytest.mark.parametrize(
     ("content", "found"),
     [
-        (make_zip(("a", b"text")), "unreadable"),
+        (make_zip(("a", b"text")), "unreadable as"),
         (make_zip(("a.npy", encode_npy(ROWS)[:-1])), "EOF"),
         (make_zip(("a.npy", encode_npy_header("(100000, 100000, 100000)"))), "allocate"),
         (make_zip(("a.npy", encode_npy(np.array([{}])))), "Object arrays"),
@@ -125,7 +125,7 @@ def test_read_npz_damaged_raises(content: bytes, found: str):
 def test_read_file_larger_than_memory_raises(read: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     (tmp_path / "a.npy").write_bytes(encode_npy(ROWS))
     monkeypatch.setattr(memory, "free_memory", lambda *_: ROWS.nbytes - 1.0)
-    with pytest.raises(InputError, match="that take at least"):
+    with pytest.raises(InputError, match="need at least"):
         read(tmp_path / "a.npy")
 
 

@@ -99,8 +99,8 @@ def calibrate(folder: Path, observations: Sequence[PhotoObservation], layout: di
         raise InputError(folder, "", found, f"at least {MIN_PHOTOS}", advice)
     tilt = max(_measure_tilt(s) for s in used)
     if tilt < MIN_TILT_RAD:
-        found = f"photos that all look straight at the tags (tilted by {np.degrees(tilt):.0f} degrees at most)"
-        raise InputError(folder, "", found, "tags seen from different angles", TILT_ADVICE)
+        found = f"all photos look straight at the tags (tilted by {np.degrees(tilt):.0f} degrees at most)"
+        raise InputError(folder, "", found, hint=TILT_ADVICE)
     first = estimate_initial_lens(used)
     solution, photos = solve_without_outliers(
         observations, exclusions, lambda left: _fit_lens_model(first, left, layout), MIN_PHOTOS
@@ -115,7 +115,7 @@ def calibrate(folder: Path, observations: Sequence[PhotoObservation], layout: di
     focal_fraction = lens.fx / max(lens.width, lens.height)
     if not uncertainty < MAX_UNCERTAINTY or not MIN_FOCAL_FRACTION < focal_fraction < MAX_FOCAL_FRACTION:
         found = f"focal length {lens.fx:.0f} pixels, uncertain by {100 * uncertainty:.0f} %"
-        raise InputError(folder, "", found, "tags seen from different angles", TILT_ADVICE)
+        raise InputError(folder, "", found, hint=TILT_ADVICE)
     warnings = {
         f"the focal length is uncertain by {100 * uncertainty:.1f} %: take more photos from other angles": (
             uncertainty > GOOD_UNCERTAINTY

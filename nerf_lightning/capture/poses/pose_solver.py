@@ -174,7 +174,7 @@ def solve_poses(
     options = [(s, found) for s in observations if (found := estimate_camera_poses(lens, s.detections, tags))]
     if not options:
         folder = observations[0].path.parent
-        raise InputError(folder, "", "tags that fit no camera", "photos of flat, undamaged tags, of the size given")
+        raise InputError(folder, "", "the tags fit no camera", hint="keep them flat and give their true size")
     chosen = resolve_flips(
         [found for _, found in options], [collect_correspondences(s.detections, tags)[0] for s, _ in options]
     )

@@ -158,6 +158,6 @@ def guess_dictionary(paths: Sequence[Path], photos: int = 4) -> str:
     best = max(COMMON_DICTIONARIES, key=counts.__getitem__)
     if not counts[best]:
         found = f"no tag of a common family in {len(small)} of {len(paths)} photos"
-        advice = "name the family with dictionary if it is an unusual one"
-        raise InputError(paths[0].parent, "", found, "sharp photos of printed ArUco tags with a white rim", advice)
+        advice = "take sharp photos of tags with a white rim, or name their family with dictionary"
+        raise InputError(paths[0].parent, "", found, hint=advice)
     return best

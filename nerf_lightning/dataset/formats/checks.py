@@ -32,7 +32,7 @@ def require_keys(where: object, have: Iterable[str], needed: Sequence[str]) -> N
     have = sorted(have)
     for key in needed:
         if key not in have:
-            raise InputError(where, key, f"no such key among [{', '.join(have)}]", f"all of {', '.join(needed)}")
+            raise InputError(where, key, "missing", hint=f"keys there: {', '.join(have)}")
 
 
 def parse_number(where: object, key: str, value: Any) -> float:
@@ -48,7 +48,7 @@ def parse_floats(where: object, key: str, value: Any) -> Float[np.ndarray, "..."
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(where, key, f"no numbers ({error})", "numbers, in rows of one length") from error
+        raise InputError(where, key, f"not numbers in rows of one length ({error})") from error
 
 
 def parse_array(where: object, key: str, value: Any, *shape: int) -> Float[np.ndarray, "..."]:

@@ -40,7 +40,7 @@ def find_models(source: Path) -> list[Path]:
     usual = [source / name for name in MODEL_FOLDERS if source / name in found]
     if not usual and len(found) > 1:
         shown = ", ".join(folder.relative_to(source).as_posix() for folder in sorted(found)[:MAX_SHOWN])
-        raise InputError(source, "", f"several COLMAP models: {shown}", "one", "give the path of one of them")
+        raise InputError(source, "", f"several COLMAP models: {shown}", hint="give the path of one")
     models = found[next(iter(usual or found))] if found else []
     return sorted(models, key=lambda model: find_model_files(model)[1].stat().st_size, reverse=True)
 
@@ -65,7 +65,7 @@ def load_colmap(
     models = find_models(source)
     if not models:
         expected = " and ".join(f"{file}.bin or .txt" for file in MODEL_FILES[:2])
-        raise InputError(source, "", "no COLMAP model", f"{expected} in it or in sparse/0")
+        raise InputError(source, "", f"no COLMAP model: neither here nor in sparse/0 are {expected}")
     folder = models[0]
     if len(models) > 1:
         log.warning("%s: the largest model; others: %s", folder, ", ".join(other.name for other in models[1:]))

@@ -77,11 +77,10 @@ def read_model(folder: Path) -> tuple[list[RegisteredImage], Float[np.ndarray, "
     images = []
     for name, camera, pose in photos:
         if camera not in intrinsics:
-            expected = "a camera of the model's cameras file"
-            raise InputError(files[1], name, f"camera {camera}, which is not there", expected)
+            raise InputError(files[1], name, f"its camera {camera} is missing from {files[0].name}")
         images.append(RegisteredImage(name, intrinsics[camera], invert_pose(files[1], name, np.array(pose))))
     if len({image.name for image in images}) < len(images):
-        raise InputError(files[1], "", "two photos of one name", "a name of its own for each")
+        raise InputError(files[1], "", "two photos have one name", hint="rename one")
     places = np.array(points, np.float64).reshape(-1, 3)
     return images, places[(np.abs(places) <= checks.MAX_COORDINATE).all(1)]
 
@@ -92,7 +91,7 @@ def _read_rows(path: Path, parse: Callable[[Path], Iterator[Record]]) -> list[Re
     except InputError:
         raise
     except (struct.error, ValueError, OverflowError) as error:
-        raise InputError(path, "", f"a damaged file ({error})", "a whole COLMAP file", "copy it again") from error
+        raise InputError(path, "", f"damaged ({error})", hint="copy it again") from error
 
 
 def make_intrinsics(

@@ -96,8 +96,8 @@ def find_images(root: Path, names: Sequence[str], where: object) -> list[Path | 
     for file, claimants in claims.items():
         (length, name), *others = sorted(claimants, reverse=True)
         if others and others[0][0] == length:
-            both = f"{others[0][1]!r} and {name!r}, of which only {file.relative_to(root)} is there"
-            raise InputError(where, "", both, "a photo for each", "is the folder of photos complete?")
+            both = f"{others[0][1]!r} and {name!r} both match {file.relative_to(root)} alone"
+            raise InputError(where, "", both, hint="is the folder of photos complete?")
         found[name] = file
         inside = file.relative_to(root)
         if PurePosixPath(name.replace("\\", "/")) not in (inside, inside.with_suffix("")):
@@ -120,7 +120,7 @@ def _find_closest(root: Path, name: str, free: Mapping[str, list[Path]], where: 
     best = [file for file, rank in ranks.items() if rank == max(ranks.values())]
     if len(best) > 1:
         shown = ", ".join(file.relative_to(root).as_posix() for file in best[:MAX_SHOWN])
-        raise InputError(where, "", f"{name!r}, which may mean {len(best)} files: {shown}", "the path of one file")
+        raise InputError(where, "", f"{name!r} may mean {len(best)} files: {shown}", hint="name one by its path")
     return (best[0], ranks[best[0]][0]) if best else None
 
 
@@ -137,8 +137,8 @@ def drop_missing(where: object, photos: Sequence[Photo], files: Sequence[Path | 
     """The photos whose file is there, and it. A line names the others; InputError if those are the majority."""
     missing = sorted(photo.name for photo, file in zip(photos, files, strict=True) if file is None)
     if 2 * len(missing) > len(photos):
-        found = f"{missing[0]!r}, which is not there (nor are {len(missing) - 1} more)"
-        raise InputError(where, "", found, "at least half of the photos", "is the folder of photos in place?")
+        found = f"no file for {missing[0]!r} and {len(missing) - 1} more of {len(photos)} photos"
+        raise InputError(where, "", found, hint="is the folder of photos in place?")
     if missing:
         shown = join_truncated(missing, MAX_SHOWN)
         log.warning("%s: %d of %d photos are not there, %s: left out", where, len(missing), len(photos), shown)

@@ -87,7 +87,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     except InputError:
         raise
     except (*DECODE_ERRORS, Image.DecompressionBombError) as error:
-        raise InputError(path, "", f"no readable image ({error})", FORMATS, "copy it again or convert it") from error
+        raise InputError(path, "", f"no readable image ({error})", hint="copy it again or convert it") from error
 
 
 def read_header(path: Path) -> ImageHeader:

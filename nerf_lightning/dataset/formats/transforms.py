@@ -146,8 +146,7 @@ def read_masks(source: Path, photos: Sequence[tuple[Frame, Path]], folder: Path)
     masks = [found.get(str(name)) for name in names]
     for (frame, _), name, mask in zip(photos, names, masks, strict=True):
         if name and mask is None:
-            expected = "an image, white where the photo is kept"
-            raise InputError(frame.where, "mask_path", f"{name!r}, which is not there", expected)
+            raise InputError(frame.where, "mask_path", f"no such file: {name}")
     return masks
 
 

@@ -30,7 +30,7 @@ def find_photos(folder: Path, key: str) -> list[Path]:
         InputError: no such folder, or no photo in it.
     """
     if not folder.is_dir():
-        raise InputError("config", key, f"{folder}, which is no folder", "a folder of photos")
+        raise InputError("config", key, f"no such folder: {folder}")
     photos = sorted(list_images(folder), key=lambda photo: make_natural_key(photo.name))
     if not photos:
         others = sorted({file.suffix.lower() for file in folder.iterdir() if file.suffix})

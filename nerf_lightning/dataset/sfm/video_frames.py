@@ -103,8 +103,8 @@ def decode_frames(video: Path, words: str) -> Iterator["av.VideoFrame"]:
                 if not frame.is_corrupt:  # FFmpeg paints over what is damaged
                     yield frame
     except av.FFmpegError as error:
-        found = f"something unreadable ({error.strerror})"
-        raise InputError(video, "", found, "a whole video", "copy it again, or save it as .mp4") from error
+        found = f"cannot be decoded ({error.strerror})"
+        raise InputError(video, "", found, hint="copy it again, or save it as .mp4") from error
 
 
 def measure_frames(video: Path) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
