@@ -1,4 +1,4 @@
-"""import nerf_lightning as nl: what the command line does, from Python."""
+"""Python API: the same as the command line, from `import nerf_lightning as nl`."""
 
 import math
 from collections.abc import Iterator

@@ -76,7 +76,7 @@ def commands(page: Path) -> list[str]:
 
 
 def place(tmp_path: Path) -> Path:
-    """A folder with a name of letters that shells, Hydra and URLs take apart."""
+    """A folder whose name needs quoting in shells, Hydra and URLs."""
     folder = tmp_path / "it's a test, (1) = ünï"
     folder.mkdir(exist_ok=True)
     return folder
