@@ -78,7 +78,7 @@ def test_render_check_page_shows_photos_worst_first(views: Views, tmp_path: Path
     )
     text = page.read_text(encoding="utf-8")
     assert "14 to train on, 2 held out" in text and "16 of 64 x 64" in text
-    assert "1 photos have no place in the model, 9999.png" in text and "<b>" not in text.split("<figure")[0]
+    assert "ignoring 1 photos that are not in the model: 9999.png" in text and "<b>" not in text.split("<figure")[0]
     assert "a &lt;b&gt;" in text and "http" not in text.replace("http-equiv", "")
     figures = text.split("<figure")[1:]
     assert len(figures) == 16 and "0009.png" in figures[0] and "0000.png" in figures[1]

@@ -243,7 +243,7 @@ def test_refine_auto_bad_silhouettes_enable_poses(tmp_path: Path):
         folder = tmp_path / str(wanted)
         train(compose_config(options, folder), folder=folder, scene=scene)
         results = json.loads((folder / "results.json").read_text())
-        assert any("outlines that no body has" in warning for warning in results["warnings"]) == wanted
+        assert any("inconsistent silhouettes" in warning for warning in results["warnings"]) == wanted
         assert any(results["corrections"]["turned_degrees"]) == wanted
 
 

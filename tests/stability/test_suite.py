@@ -96,7 +96,7 @@ def test_run_trials_processes_end_with_generator(tmp_path: Path):
         ("clean", replace(GOOD, status="collapsed"), False),
         ("OpenGL poses", replace(GOOD, psnr=None, status="refused"), True),
         ("OpenGL poses", GOOD, False),
-        ("shuffled poses", replace(GOOD, alarm="outlines that no body has"), True),
+        ("shuffled poses", replace(GOOD, alarm="inconsistent silhouettes"), True),
         ("world x10", replace(GOOD, psnr=29.5), True),
         ("world x10", replace(GOOD, psnr=28.5), False),
     ],
