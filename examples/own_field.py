@@ -1,4 +1,4 @@
-"""A field of your own, here a grid of densities and colours, trained by Lightning's own Trainer.
+"""A custom field, here a dense grid of density and colour, trained by Lightning's Trainer.
 
 python examples/own_field.py SCENE.npz 1000
 """
@@ -20,8 +20,8 @@ class Grid(model.Field):
         self.grid = torch.nn.Parameter(torch.zeros(1, 4, cells, cells, cells))
 
     def features(self, positions):
-        places = 2 * self.bounds.to_unit(positions) - 1
-        values = torch.nn.functional.grid_sample(self.grid, places[None, None, None], align_corners=True)
+        grid_positions = 2 * self.bounds.to_unit(positions) - 1
+        values = torch.nn.functional.grid_sample(self.grid, grid_positions[None, None, None], align_corners=True)
         return values[0, 0].flatten().exp(), values[0, 1:].flatten(1).T
 
     def colour(self, features, directions):
@@ -31,10 +31,10 @@ class Grid(model.Field):
 if __name__ == "__main__":
     scene = nl.load_scene(sys.argv[1])
     data, box = dataset.RayDataModule(scene), scene.bounds
-    behind = renderer.VolumeRenderer(scene_background=scene.background)
-    adam = partial(torch.optim.Adam, lr=0.1)
-    nerf = system.NeRF3D(Grid(box), sampler.OccupancySampler(box), behind, adam, system.exponential)
+    volume_renderer = renderer.VolumeRenderer(scene_background=scene.background)
+    optimizer = partial(torch.optim.Adam, lr=0.1)
+    nerf = system.NeRF3D(Grid(box), sampler.OccupancySampler(box), volume_renderer, optimizer, system.exponential)
     L.Trainer(max_steps=int(sys.argv[2]), accelerator="cpu", logger=False, enable_checkpointing=False).fit(nerf, data)
     view = nerf.evaluate(data.get_held_out_view(0))
-    print(f"{view.psnr:.2f} dB on a view it never saw")
+    print(f"{view.psnr:.2f} dB on a held-out view")
     imageio.imwrite("own_field.png", (255 * torch.cat([view.rgb, view.truth], dim=1)).round().byte().numpy())

@@ -1,4 +1,4 @@
-"""A loss of your own, here on opacity: a ray shows the content or the background, and nothing between.
+"""A custom loss, here the entropy of opacity: rays hit either the content or the background.
 
 python examples/own_loss.py SCENE.npz 1000
 """
@@ -23,8 +23,10 @@ class EntropyNeRF3D(system.NeRF3D):
 if __name__ == "__main__":
     scene = nl.load_scene(sys.argv[1])
     data, box = dataset.RayDataModule(scene), scene.bounds
-    behind = renderer.VolumeRenderer(scene_background=scene.background)
-    adam = partial(torch.optim.Adam, lr=0.01)
-    nerf = EntropyNeRF3D(model.HashGridField(box), sampler.OccupancySampler(box), behind, adam, system.exponential)
+    volume_renderer = renderer.VolumeRenderer(scene_background=scene.background)
+    optimizer = partial(torch.optim.Adam, lr=0.01)
+    nerf = EntropyNeRF3D(
+        model.HashGridField(box), sampler.OccupancySampler(box), volume_renderer, optimizer, system.exponential
+    )
     L.Trainer(max_steps=int(sys.argv[2]), accelerator="cpu", logger=False, enable_checkpointing=False).fit(nerf, data)
-    print(f"{nerf.evaluate(data.get_held_out_view(0)).psnr:.2f} dB on a view it never saw")
+    print(f"{nerf.evaluate(data.get_held_out_view(0)).psnr:.2f} dB on a held-out view")

@@ -1,4 +1,4 @@
-"""A sampler of your own, here steps that grow with the distance, trained by Lightning's own Trainer.
+"""A custom sampler, here steps that grow with the distance, trained by Lightning's Trainer.
 
 python examples/own_sampler.py SCENE.npz 1000
 """
@@ -26,8 +26,8 @@ class Geometric(sampler.Sampler):
 if __name__ == "__main__":
     scene = nl.load_scene(sys.argv[1])
     data, box = dataset.RayDataModule(scene), scene.bounds
-    behind = renderer.VolumeRenderer(scene_background=scene.background)
-    adam = partial(torch.optim.Adam, lr=0.01)
-    nerf = system.NeRF3D(model.HashGridField(box), Geometric(box), behind, adam, system.exponential)
+    volume_renderer = renderer.VolumeRenderer(scene_background=scene.background)
+    optimizer = partial(torch.optim.Adam, lr=0.01)
+    nerf = system.NeRF3D(model.HashGridField(box), Geometric(box), volume_renderer, optimizer, system.exponential)
     L.Trainer(max_steps=int(sys.argv[2]), accelerator="cpu", logger=False, enable_checkpointing=False).fit(nerf, data)
-    print(f"{nerf.evaluate(data.get_held_out_view(0)).psnr:.2f} dB on a view it never saw")
+    print(f"{nerf.evaluate(data.get_held_out_view(0)).psnr:.2f} dB on a held-out view")

@@ -1,1 +1,1 @@
-"""The command line: a module a command, each a typed function that gives options, ranges, help and the Python interface."""
+"""Command line: one typed function per command defines its options, bounds, help and Python API."""

@@ -1,4 +1,4 @@
-"""nerf_lightning COMMAND: all commands in the order of the work, and errors in one line. Imports nothing heavy."""
+"""The nerf_lightning command: all commands in workflow order, and one-line errors. Fast to import."""
 
 import inspect
 import os
@@ -27,7 +27,7 @@ from nerf_lightning.utils.libraries import limit_openmp_spinning
 from nerf_lightning.utils.signals import exit_on_signal
 
 TRACEBACK_VARIABLE = "NERF_LIGHTNING_TRACEBACK"
-"""Environment variable: set to 1, errors come with the full traceback."""
+"""Environment variable: 1 prints full tracebacks."""
 
 QUICK_START = """From a folder of photos to a page to send, and a mesh:
 
@@ -35,7 +35,7 @@ QUICK_START = """From a folder of photos to a page to send, and a mesh:
     nerf_lightning export html -o page.html
     nerf_lightning export mesh -o mesh.glb
 
-nerf_lightning COMMAND --help says more of each."""
+nerf_lightning COMMAND --help explains each command."""
 
 app = App(
     name="nerf_lightning",
@@ -60,7 +60,7 @@ for _command in _commands:
         app.command(_command)
 for _number, _name in enumerate(app.resolved_commands()):
     app[_name].sort_key = _number
-    app[_name].help_epilogue = ""  # its own, not that of the front page
+    app[_name].help_epilogue = ""  # not that of the front page
 app.register_install_completion_command()
 for _name in ("--help", "--version", "--install-completion"):
     app[_name].group = "Options"
@@ -69,7 +69,7 @@ for _name in ("--help", "--version", "--install-completion"):
 def main(arguments: Sequence[str] | None = None) -> None:
     """Runs a command line; exits with 2 on bad input or a full disk, 130 after Ctrl-C and 143 after SIGTERM.
 
-    Bad input is anything the user can fix: it gets one line. Anything else is a defect and keeps its traceback.
+    Errors that the user can fix are printed in one line; all others are defects and keep their traceback.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words and is_override(words[0]):
@@ -87,15 +87,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def find_input_error(error: Exception) -> InputError | None:
-    """What the user can mend about an error: bad input, a file that cannot be read or written, a torchvision built
-    for another PyTorch, or memory that ran out; None for a defect."""
+    """Converts an error that the user can fix (bad input, file access, a mismatched torchvision, out of memory) to an
+    InputError; None for a defect."""
     if isinstance(error, InputError):
         return error
     if is_disk_full(error):
         return disk_full_error(getattr(error, "filename", None) or os.getcwd())
     if isinstance(error, OSError) and error.filename:
         return InputError(error.filename, "", str(error.strerror), hint="check the path and its permissions")
-    if "torchvision::" in str(error):  # torchmetrics, which Lightning needs, imports an installed one
+    if "torchvision::" in str(error):  # imported by torchmetrics, a dependency of Lightning
         hint = "pip install --force-reinstall --no-deps torchvision, from the package index that PyTorch came from"
         return InputError("torchvision", "", f"not built for this PyTorch ({error})", hint=hint)
     if isinstance(error, MemoryError | RuntimeError):
@@ -106,7 +106,7 @@ def find_input_error(error: Exception) -> InputError | None:
 
 
 def exit_with_error(error: Exception) -> NoReturn:
-    """Prints an error in one line, with its traceback if the environment asks for it, and exits with 2."""
+    """Prints an error in one line, after its traceback if `TRACEBACK_VARIABLE` is 1, and exits with 2."""
     if os.environ.get(TRACEBACK_VARIABLE) == "1":
         traceback.print_exception(error)
     print(

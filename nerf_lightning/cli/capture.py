@@ -11,9 +11,9 @@ from nerf_lightning.utils.files import check_output_path, expand_user_path
 from nerf_lightning.utils.option_checks import Ge, Le
 
 TagSize = Annotated[float, Ge(1e-4), Le(1)]
-"""Metres: printers make no smaller dots, and larger numbers are in another unit."""
+"""Metres, above the size of a printer's dots; larger numbers are probably in another unit."""
 BoardSquares = Annotated[int, Ge(3), Le(1000)]
-"""Along a side of a chessboard with inner corners."""
+"""Squares along a side of a ChArUco board."""
 
 
 @command
@@ -31,25 +31,25 @@ def capture(
     resize: Annotated[int, Ge(0)] = 300,
     holdout: Annotated[int, Ge(2)] = 10,
 ) -> Any:
-    """Turn photos of a subject beside printed ArUco tags into a scene, with a report beside it.
+    """Create a scene from photos of a subject with printed ArUco tags in view, and a report.
 
-    Photos in which the subject hides all tags are placed by their texture, where pycolmap is installed.
+    Photos without visible tags are registered by their texture, if pycolmap is installed.
 
     Args:
-        calibration: Folder of photos of the tags alone, from many angles.
+        calibration: Folder of photos of only the tags, from many angles.
         photos: Folder of photos of the subject with tags in view, in the order taken, with the same zoom.
         tag_size: Side of a tag's black square, metres.
-        output: Scene to write, FILE.npz; cameras.json, calibration.yaml and FILE_report/ go beside it.
+        output: Scene to write, FILE.npz; cameras.json, calibration.yaml and FILE_report/ go to its folder.
         dictionary: OpenCV's name of the tags' family, such as DICT_4X4_50; auto tries the common ones.
-        layout: sheet_2x3, or a YAML file of where the tags lie; default: found from the photos.
-        board_columns: Squares of a ChArUco board from left to right, if one is used in place of tags.
+        layout: sheet_2x3, or a YAML file of tag positions; default: estimated from the photos.
+        board_columns: Squares of a ChArUco board from left to right, if used instead of tags.
         board_rows: Squares of the board from top to bottom.
         board_square: Side of a square of the board, metres.
         resize: Longest side of the scene's photos, pixels; 0 keeps their size.
         holdout: Every N-th photo is held out for validation.
 
     Raises:
-        InputError: an option or a photo is no good.
+        InputError: an invalid option or photo.
     """
     target = check_output_path(output)
     if target.suffix != ".npz":
@@ -61,7 +61,7 @@ def capture(
     from nerf_lightning.capture.report.report import write_report
     from nerf_lightning.capture.tags.board import Board
 
-    found = capture_scene(
+    captured = capture_scene(
         expand_user_path(calibration),
         expand_user_path(photos),
         tag_size,
@@ -72,27 +72,27 @@ def capture(
         max_side=resize or None,
         holdout=holdout,
     )
-    write_report(found, report := target.with_name(f"{target.stem}_report"))
-    placed = sum(photo.c2w is not None for photo in found.photos)
-    print(f"{placed} of {len(found.photos)} photos placed; wrote {target}, cameras.json and calibration.yaml")
+    write_report(captured, report := target.with_name(f"{target.stem}_report"))
+    placed = sum(photo.c2w is not None for photo in captured.photos)
+    print(f"{placed} of {len(captured.photos)} photos placed; wrote {target}, cameras.json and calibration.yaml")
     print(f"look at {report}, then: nerf_lightning train +experiment=capture dataset.path={target}")
-    return found
+    return captured
 
 
 @command
 def print_tags(
     sheet: Path, /, *, tag_size: TagSize = 0.06, dictionary: str = "DICT_4X4_50", layout: Path = Path("sheet_2x3")
 ) -> None:
-    """Write a page of ArUco tags to print, A4 at its true size.
+    """Write an A4 page of ArUco tags, to be printed at 100 % scale.
 
     Args:
         sheet: FILE.pdf to write.
         tag_size: Side of a tag's black square, metres.
         dictionary: OpenCV's name of the tags' family.
-        layout: sheet_2x3 (six tags), or a YAML file of where the tags lie.
+        layout: sheet_2x3 (six tags), or a YAML file of tag positions.
 
     Raises:
-        InputError: no PDF, an unknown family or layout, or tags that do not fit on the page.
+        InputError: no .pdf, an unknown family or layout, or tags that do not fit on the page.
     """
     from nerf_lightning.capture.tags.printout import write_sheet_pdf
     from nerf_lightning.capture.tags.tag_layout import read_layout

@@ -20,23 +20,23 @@ def check(
     bounded: Literal["auto", "true", "false"] = "auto",
     orientation: Literal["auto", "stored", "exif"] = "auto",
 ) -> list[str]:
-    """Check a scene's photos and cameras before training: one page, and a line for all that looks wrong.
+    """Check a scene's photos and cameras before training: an HTML report, and a line per problem.
 
     Args:
-        scene: A folder of photos, a video, or photos with cameras; train --help lists the formats.
-        output: The page; default: check.html where the command runs.
-        resize: Longest side of the photos in pixels, as in training; null for their size.
-        holdout: Every N-th photo is held out, unless the files say which.
-        masked: What masks leave out: ignore, background or auto.
-        invert_masks: Masks are black where the photo is kept.
-        bounded: Whether nothing is outside the box: true, false, or auto by the photos.
-        orientation: How photos are turned: stored, exif, or auto as their cameras say.
+        scene: A folder of photos, a video, or photos with cameras; see train --help for formats.
+        output: Report to write; default: check.html in the current folder.
+        resize: Longest side of the photos in pixels, as in training; null keeps their size.
+        holdout: Every N-th photo is held out, unless the files define a split.
+        masked: Meaning of masked-out pixels: ignore, background or auto.
+        invert_masks: Masks are black where photos are kept.
+        bounded: Whether the scene ends at its box: true, false, or auto from the photos.
+        orientation: Rotation of photos: stored, exif, or auto to match their cameras.
 
     Returns:
-        The lines.
+        The printed lines.
 
     Raises:
-        InputError: where there is no scene, or a damaged one.
+        InputError: no scene, or a damaged one.
     """
     from nerf_lightning.check.report import assess_photos, check_before_training, record_warnings, render_check_page
     from nerf_lightning.dataset import PhotoLoadOptions, open_scene
@@ -45,13 +45,13 @@ def check(
     path = check_output_path(output or "check.html")
     with record_warnings() as records:
         options = PhotoLoadOptions(resize, holdout, masked, invert_masks, bounded, orientation)
-        found = open_scene(str(scene), options=options)
-        remarks = check_before_training(found)
+        loaded = open_scene(str(scene), options=options)
+        remarks = check_before_training(loaded)
     warnings = [record.getMessage() for record in records]
-    photos, poses = assess_photos(found)
-    write_text(path, render_check_page(found, warnings + remarks, photos, poses))
+    photos, poses = assess_photos(loaded)
+    write_text(path, render_check_page(loaded, warnings + remarks, photos, poses))
     bad = [f"{photo.name}: {issue}" for photo in photos for issue in photo.issues]
     for line in remarks + bad:
         print(line)
-    print(f"{found.name}: {len(photos)} photos, {len(bad)} remarks on them; {path}")
+    print(f"{loaded.name}: {len(photos)} photos, {len(bad)} remarks on them; {path}")
     return warnings + remarks + bad

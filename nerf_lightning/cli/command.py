@@ -1,4 +1,4 @@
-"""Shared types of the commands' parameters, and the check of their values. Imports nothing heavy."""
+"""Shared parameter types of commands, and validation of their values. Fast to import."""
 
 import functools
 import inspect
@@ -15,20 +15,20 @@ VAR_POSITIONAL = inspect.Parameter.VAR_POSITIONAL
 T = TypeVar("T")
 
 Output = Annotated[Path | None, Parameter(alias="-o")]
-"""What a command writes; each says where None puts it."""
+"""Output path; each command documents its default."""
 RunPath = Annotated[
     Path | None,
     Parameter(help="A run's folder or compact.npz, or a folder of runs for its newest; default: the latest run."),
 ]
-Photos = Annotated[Path | None, Parameter(help="The photos, if they have moved since training.")]
-Device = Annotated[str, Parameter(help="auto, cpu, cuda or mps; auto takes the best there is.")]
+Photos = Annotated[Path | None, Parameter(help="Photos, if they have moved since training.")]
+Device = Annotated[str, Parameter(help="auto (the best available), cpu, cuda or mps.")]
 
 
 def command(function: Callable[P, T]) -> Callable[P, T]:
-    """Makes a function check its arguments against its annotations, wherever it is called from; text stands for a path.
+    """Decorator: checks arguments against annotations, and converts text to paths.
 
     Raises:
-        InputError: by the function, for a value that its annotation excludes.
+        InputError: (when called) a value violates its annotation.
     """
     signature, hints = inspect.signature(function), get_type_hints(function)
     parameters = signature.parameters
@@ -41,10 +41,10 @@ def command(function: Callable[P, T]) -> Callable[P, T]:
                 continue
             if isinstance(value, str):
                 bound.arguments[key] = Path(value)
-            elif isinstance(value, tuple):  # of *paths
+            elif isinstance(value, tuple):  # *paths
                 bound.arguments[key] = tuple(map(Path, value))
-        given = {key: value for key, value in bound.arguments.items() if parameters[key].kind is not VAR_POSITIONAL}
-        check_options("", function, given, source=function.__name__.replace("_", "-"))
+        named = {key: value for key, value in bound.arguments.items() if parameters[key].kind is not VAR_POSITIONAL}
+        check_options("", function, named, source=function.__name__.replace("_", "-"))
         return function(*bound.args, **bound.kwargs)
 
     return checked

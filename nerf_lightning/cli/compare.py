@@ -15,22 +15,22 @@ def compare(
     references: str = "published",
     output: Output = None,
 ) -> Any:
-    """Compare runs: which method is worth its time and bytes, as a page, a figure, a table and advice in words.
+    """Compare runs by quality, time and size: an HTML page, a figure, a table and recommendations.
 
-    Medians over seeds; runs of other scenes or machines stand apart. `train +experiment=pareto` makes runs to compare.
+    Medians over seeds, grouped by scene and machine. `train +experiment=pareto` makes runs to compare.
 
     Args:
-        runs: Folders with runs in them or below them; default: outputs/.
-        seconds: Name the best after this much training, too.
-        within_db: How near to the best the fastest and the smallest must be, dB.
-        references: Published figures of the same scene: published, none, or a YAML file of your own.
+        runs: Folders to search for runs; default: outputs/.
+        seconds: Also recommend the best within this training time.
+        within_db: Allowed distance of the fastest and the smallest from the best, dB.
+        references: Published results of the same scene: published, none, or a YAML file.
         output: Folder for compare.html, compare.png and compare.csv; default: compare/ in the first folder.
 
     Returns:
         The pandas.DataFrame that compare.csv holds.
 
     Raises:
-        InputError: for a folder that is not there or holds no run, and for references that cannot be read.
+        InputError: a missing folder, no runs, or invalid references.
     """
     from nerf_lightning.comparison.points import PUBLISHED_FILE, read_references
     from nerf_lightning.comparison.report import write_comparison
@@ -43,5 +43,5 @@ def compare(
     file = PUBLISHED_FILE if references in ("published", "none") else expand_user_path(references)
     published = read_references(file)
     published = published.head(0) if references == "none" else published
-    found = {run.folder.resolve(): run for folder in folders for run in find_runs(folder)}
-    return write_comparison(list(found.values()), folder, published, within_db, seconds)
+    summaries = {run.folder.resolve(): run for folder in folders for run in find_runs(folder)}
+    return write_comparison(list(summaries.values()), folder, published, within_db, seconds)

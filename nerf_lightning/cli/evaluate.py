@@ -19,20 +19,20 @@ def evaluate(
     output: Output = None,
     device: Device = "auto",
 ) -> dict[str, Any]:
-    """Measure a run view by view: PSNR, SSIM and LPIPS on photos that it was not trained on.
+    """Evaluate a run: PSNR, SSIM and LPIPS of each held-out view.
 
-    LPIPS needs torchvision, the weights of its AlexNet in torch.hub's folder (nothing is downloaded), and views of 64 pixels.
+    LPIPS needs torchvision, its AlexNet weights in torch.hub's folder (nothing is downloaded), and views of 64 pixels.
 
     Args:
-        split: val, or test where the scene's files have a test split, as published figures are measured.
-        worst: How many of the worst views to draw.
+        split: val, or test (as in publications) if the scene's files define a test split.
+        worst: Number of worst views to draw.
         output: Folder for worst.png and views.json; default: evaluation/ in the run.
 
     Returns:
-        What views.json holds: `mean` and `views`.
+        The content of views.json: `mean` and `views`.
 
     Raises:
-        InputError: where the device, the run or the photos are no good, or do not fit each other, or have no such split.
+        InputError: an invalid device, run, photos or split.
     """
     from dataclasses import replace
 
@@ -46,14 +46,14 @@ def evaluate(
     from nerf_lightning.utils.machine import describe_device
 
     where, source = resolve_device(device), find_run(run)
-    found = open_run(source, where)
-    data = reload_data(found.cfg, found.scene, photos)
+    loaded = open_run(source, where)
+    data = reload_data(loaded.cfg, loaded.scene, photos)
     if split == "test":
         if data.scene.test is None:
             raise InputError("evaluate", "split", "these photos have no test split", hint="give split=val")
         data.scene = replace(data.scene, val=data.scene.test)
     folder = get_output_folder(source) / "evaluation" if output is None else check_output_path(output)
-    metrics, results = measure_views(found.system, data, worst)
+    metrics, results = measure_views(loaded.system, data, worst)
     evaluation = to_json(metrics, source, data.scene.describe(), where)
     write_json(folder / "views.json", evaluation)
     order = sorted(results, key=lambda view: results[view].psnr)

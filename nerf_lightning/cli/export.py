@@ -1,4 +1,4 @@
-"""nerf_lightning export: a sub-command for each kind of file."""
+"""nerf_lightning export: one subcommand per file type."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,14 +12,16 @@ from nerf_lightning.utils.option_checks import Ge, GridSize, Le
 
 Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
-    Parameter(help="Keep only this part: X Y Z X Y Z of its lower, then upper corner, in the photos' unit."),
+    Parameter(help="Crop to a box: X Y Z X Y Z of its lower, then upper corner, in the photos' unit."),
 ]
-Resolution = Annotated[GridSize | None, Parameter(help="Cells along the longest side; default: as fine as the photos.")]
+Resolution = Annotated[
+    GridSize | None, Parameter(help="Cells along the longest side; default: the photos' resolution.")
+]
 Threshold = Annotated[
     Annotated[float, Ge(0.001), Le(0.999)] | None,
-    Parameter(help="Opacity of a cell at the surface; default: found from the histogram of opacities."),
+    Parameter(help="Opacity of a cell at the surface; default: Otsu's method on the histogram."),
 ]
-MaxPsnrDrop = Annotated[float, Ge(0), Parameter(help="dB of held-out PSNR that may be lost.")]
+MaxPsnrDrop = Annotated[float, Ge(0), Parameter(help="Largest loss of held-out PSNR, dB.")]
 
 export = App(name="export", help="Write a run as a file for other uses.")
 
@@ -37,7 +39,7 @@ def export_mesh(
     photos: Photos = None,
     device: Device = "auto",
 ) -> Path:
-    """Write the surface with its colours, in the coordinates of the photos' own file.
+    """Write a coloured surface mesh, in the coordinates of the photos' own file.
 
     Args:
         output: FILE.ply, .glb (3D viewers), .obj (modellers) or .stl (printers; no colours); default: mesh.ply in the run.
@@ -58,7 +60,7 @@ def export_points(
     photos: Photos = None,
     device: Device = "auto",
 ) -> Path:
-    """Write points of the surface with their colours, in the coordinates of the photos' own file.
+    """Write a coloured point cloud of the surface, in the coordinates of the photos' own file.
 
     Args:
         output: FILE.ply; default: points.ply in the run.
@@ -77,7 +79,7 @@ def export_voxels(
     output: Output = None,
     device: Device = "auto",
 ) -> Path:
-    """Write density and colour of cubic cells, and where they are.
+    """Write a voxel grid of density and colour, with its transform.
 
     Args:
         output: FILE.npz; default: voxels.npz in the run.
@@ -96,7 +98,7 @@ def export_compact(
     photos: Photos = None,
     device: Device = "auto",
 ) -> Path:
-    """Write what the photos' cameras see as one small file, which all commands accept in place of a run.
+    """Write a small file of all that the photos' cameras see; all commands accept it as a run.
 
     Args:
         output: FILE.npz; default: compact.npz in the run.
@@ -109,9 +111,9 @@ def export_compact(
 
     where, source = resolve_device(device), find_run(run)
     target = _resolve_output(source, output, "compact.npz", (".npz",))
-    found = open_run(source, where)
-    data = reload_data(found.cfg, found.scene, photos)
-    compact = compress_system(found.system, data, config_to_dict(found.cfg), max_psnr_drop)
+    loaded = open_run(source, where)
+    data = reload_data(loaded.cfg, loaded.scene, photos)
+    compact = compress_system(loaded.system, data, config_to_dict(loaded.cfg), max_psnr_drop)
     size = f"{len(compact.content) / 1000:,.1f} kB, {compact.precision} precision"
     return _write(target, compact.content, f"{size}, held-out PSNR {compact.psnr_before:.2f} -> {compact.psnr:.2f} dB")
 
@@ -129,13 +131,13 @@ def export_html(
     photos: Photos = None,
     device: Device = "auto",
 ) -> Path:
-    """Write a page to turn the field in any browser, from disk; it asks no server.
+    """Write a self-contained interactive HTML viewer that works offline in any browser.
 
-    Planes and voxels are drawn as they are; other fields become voxels that learn from them, which takes minutes.
+    TensoRF and voxel fields are rendered directly; others are baked into voxels, which takes minutes.
 
     Args:
-        all: A page of each run in a folder of runs, and gallery.html with all of them side by side.
-        cells: Along a side of the voxels that replace another field; default: as fine as the photos.
+        all: Write a page for each run in a folder, and gallery.html with all of them side by side.
+        cells: Resolution of voxels that replace another field; default: the photos' resolution.
         output: FILE.html; default: field.html in the run.
     """
     from functools import partial
@@ -160,7 +162,7 @@ def export_html(
 @export.command(name="transforms")
 @command
 def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: Photos = None) -> Path:
-    """Write the photos and their cameras, as training corrected them, for nerfstudio and others.
+    """Write photos with refined cameras as transforms.json, for nerfstudio and others.
 
     Args:
         output: A new folder; default: posed/ in the run.
@@ -175,10 +177,10 @@ def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: 
     target = source / "posed" if output is None else check_output_path(output)
     if target.exists():
         raise InputError(target, "", "exists already", hint="give another -o, or remove it")
-    content = read_scene_file(source)  # a compact file does not know corrected cameras
+    content = read_scene_file(source)  # compact files lack refined cameras
     data = reload_data(load_config(source), content, photos)
     if not data.is_posed:
-        raise InputError(source, "", "a picture's run", "a scene's run")
+        raise InputError(source, "", "the run of an image", "the run of a scene")
     with atomic_write_folder(target) as temporary:
         write_photos(data.scene, temporary)
     cameras = "corrected" if "corrected" in content else "given"
@@ -187,11 +189,7 @@ def export_transforms(run: RunPath = None, /, *, output: Output = None, photos: 
 
 
 def _resolve_output(source: Path, output: Path | None, name: str, suffixes: tuple[str, ...]) -> Path:
-    """The file to write: `output`, or one of a name in the run.
-
-    Raises:
-        InputError: for another suffix.
-    """
+    """The output path: `output`, or `name` in the run's folder; checks the suffix."""
     from nerf_lightning.runs.open import get_output_folder
     from nerf_lightning.utils.files import check_output_path
 
@@ -203,7 +201,6 @@ def _resolve_output(source: Path, output: Path | None, name: str, suffixes: tupl
 
 
 def _write(target: Path, content: bytes, words: str) -> Path:
-    """Writes a file and prints what it holds."""
     from nerf_lightning.utils.files import atomic_write
 
     with atomic_write(target) as temporary:
@@ -222,7 +219,6 @@ def _write_geometry(
     threshold: float | None = None,
     photos: Path | None = None,
 ) -> Path:
-    """Writes a mesh, points or voxels."""
     if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
         raise InputError("export", "box", " ".join(map(str, box)), "the lower, then the upper corner: X Y Z X Y Z")
     import torch
@@ -243,16 +239,16 @@ def _write_geometry(
     target = _resolve_output(source, output, kind + SUFFIXES[kind][0], SUFFIXES[kind])
     if kind != "voxels":
         require_extra("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
-    found = open_scene_run(source, where)
+    loaded = open_scene_run(source, where)
     volume = sample_volume(
-        found, resolution, None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
+        loaded, resolution, None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
     )
     if kind == "voxels":
-        content, words = build_voxels_file(found, volume)
+        content, words = build_voxels_file(loaded, volume)
     elif kind == "points":
-        content, words = build_points_file(found, select_training_views(found, photos), volume, threshold)
+        content, words = build_points_file(loaded, select_training_views(loaded, photos), volume, threshold)
     else:
         suffix = target.suffix.lower()
-        content, words = build_mesh_file(found, select_training_views(found, photos), volume, threshold, suffix)
+        content, words = build_mesh_file(loaded, select_training_views(loaded, photos), volume, threshold, suffix)
     size = f"{len(content) / 1e6:,.2f} MB"
-    return _write(target, content, f"{size}, {words}, cells of {volume.cell * found.scale:.4g}")
+    return _write(target, content, f"{size}, {words}, cells of {volume.cell * loaded.scale:.4g}")

@@ -26,17 +26,17 @@ def render(
     photos: Photos = None,
     device: Device = "auto",
 ) -> Path:
-    """Render a run along a camera path, as a video or images. After an interruption the same command continues.
+    """Render a run along a camera path, as a video or images. If interrupted, the same command continues.
 
     Args:
-        path: orbit, spiral, test or train (beside the photos, with the error), or FILE.json: cameras as in a run's
-            scene.json (width, height, K, c2w), or a path of nerfstudio or instant-ngp.
-        path_frame: Frame of FILE.json: run, or file for that of the photos' own file; auto by the kind of file.
-        frames: How many, spread over the path; default: all it has.
+        path: orbit, spiral, test or train (next to the photos, with the error), or FILE.json: cameras as in a run's
+            scene.json (width, height, K, c2w), or a nerfstudio or instant-ngp path.
+        path_frame: Coordinate frame of FILE.json: run, file (the photos' own), or auto by its format.
+        frames: Number of frames along the path; default: that of the path.
         fps: Frames per second.
         background: scene (as trained), black, white, transparent, or R,G,B in 0..1.
-        scale: Times as many pixels along each side.
-        channels: rgb, depth, opacity: one or several, side by side.
+        scale: Factor on the width and height.
+        channels: One or more of rgb, depth, opacity, side by side.
         output: FILE.mp4, FILE.webp, FILE.gif, or a folder for PNGs; default: render_PATH.webp in the run.
 
     Returns:
@@ -58,14 +58,14 @@ def render(
     target = (
         get_output_folder(source) / f"render_{Path(path).stem}.webp" if output is None else check_output_path(output)
     )
-    found = open_scene_run(source, where)
-    scene: Any = reload_data(found.cfg, found.scene, photos).scene if path in PHOTO_PATHS else None
-    route = build_path(path, frames, found.orbit, scene, found.to_source, path_frame, scale)
-    style = parse_style(found.system, route, channels, background)
-    manifest, count = build_manifest(path, found.system, route, style), len(route.cameras)
-    there = write_video(manifest, partial(draw_frame, found.system, route, style), count, target, fps)
-    width, height = route.cameras.sizes.amax(0).tolist()
+    loaded = open_scene_run(source, where)
+    scene: Any = reload_data(loaded.cfg, loaded.scene, photos).scene if path in PHOTO_PATHS else None
+    camera_path = build_path(path, frames, loaded.orbit, scene, loaded.to_source, path_frame, scale)
+    style = parse_style(loaded.system, camera_path, channels, background)
+    manifest, count = build_manifest(path, loaded.system, camera_path, style), len(camera_path.cameras)
+    reused = write_video(manifest, partial(draw_frame, loaded.system, camera_path, style), count, target, fps)
+    width, height = camera_path.cameras.sizes.amax(0).tolist()
     seconds = f"{time.perf_counter() - began:.1f} s on {describe_device(where)}"
-    seconds += f", {there} of them there already" if there else ""
+    seconds += f", {reused} of them reused" if reused else ""
     print(f"{target}: {count} frames of {width} x {height} pixels in {seconds}")
     return target

@@ -10,7 +10,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.option_checks import Ge
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic")
-"""Suffixes of a 2D image."""
+"""Suffixes that select 2D training."""
 
 
 @command
@@ -25,23 +25,23 @@ def rightsize(
 ) -> dict[str, Any]:
     """Find the smallest model that is good enough, and train it.
 
-    One training climbs a ladder of sizes, growing while that is worth the bytes. The size that seems enough is then trained in
-    full, and a neighbour to compare with. Leaves runs (rung_N), compact.npz, chart.png, rightsize.json, and best.yaml for
-    train +experiment=best.yaml. Interrupted, the same command continues.
+    One training grows along a ladder of sizes while the gain justifies the bytes. The candidate size and a neighbour are then
+    trained in full. Writes runs (rung_N), compact.npz, chart.png, rightsize.json, and best.yaml for
+    train +experiment=best.yaml. If interrupted, the same command continues.
 
     Args:
-        scene: Path of a scene or an image, or the name of an experiment or a built-in scene, such as lego.
-        overrides: Options of the trainings, such as budget.seconds=60 recipe=tensorf_small.
-        within_db: How far below the best that can be reached the choice may be; default: 0.3.
-        psnr: Or: the PSNR on held-out views that is enough.
-        ladder: Sizes to try: a name in conf/ladders or a YAML file; default: those of the model.
-        output: Folder for all of it.
+        scene: Path of a scene or image, or the name of an experiment or built-in scene, such as lego.
+        overrides: Training options, such as budget.seconds=60 recipe=tensorf_small.
+        within_db: Allowed loss against the best reachable PSNR, dB; default: 0.3.
+        psnr: Alternatively, the required held-out PSNR, dB.
+        ladder: Sizes to try: a name in conf/ladders, or a YAML file; default: the model's.
+        output: Folder for all files.
 
     Returns:
-        What rightsize.json holds, such as `rung`, `model` (its options), `psnr` and `artifact_bytes`.
+        The content of rightsize.json: `rung`, `model` (its options), `psnr`, `artifact_bytes` and more.
 
     Raises:
-        InputError: where an option or the scene is no good, or the folder holds something else.
+        InputError: an invalid option or scene, or the folder holds something else.
     """
     if within_db is not None and psnr is not None:
         raise InputError("rightsize", "psnr", f"{psnr:g} and within_db={within_db:g}", "one of the two")
@@ -67,16 +67,16 @@ def rightsize(
     with lock_folder(folder):
         if (folder / REPORT_FILE).is_file():
             start_or_resume(folder, cfg, target, sizes)
-            found = read_json(folder / REPORT_FILE, "a finished search")
+            result = read_json(folder / REPORT_FILE, "a finished search")
         else:
-            found = search_sizes(cfg, target, sizes, folder)
-            write_report(found, cfg, folder)
-    print(explain_choice(found, folder))
-    return found
+            result = search_sizes(cfg, target, sizes, folder)
+            write_report(result, cfg, folder)
+    print(explain_choice(result, folder))
+    return result
 
 
 def describe_scene(scene: str) -> list[str]:
-    """The overrides that a scene's path or an experiment's name stands for."""
+    """Overrides that select a scene by its path, or an experiment by its name."""
     from nerf_lightning.config import conf_dir
     from nerf_lightning.config.quoting import make_override
     from nerf_lightning.utils.files import expand_user_path

@@ -20,23 +20,23 @@ def stability(
     workers: Annotated[int, Ge(1)] | None = None,
     output: Annotated[Path, Parameter(alias="-o")] = Path("outputs/stability"),
 ) -> dict[str, Any]:
-    """Train methods on small scenes made to be hard, and say which broke down.
+    """Train methods on small scenes under adverse conditions, and report which fail.
 
-    Leaves heatmap.png, heatmap_2d.png, worst.png and stability.json. The same command continues where it stopped.
+    Writes heatmap.png, heatmap_2d.png, worst.png and stability.json. If interrupted, the same command continues.
 
     Args:
-        suite: quick: a few conditions, a quarter of an hour; full: all of them, in an hour or two.
-        methods: Some of those in conf/stability.yaml, such as hashgrid "2D mlp"; default: all, with controls that must fail.
-        seeds: Trainings of each condition and method.
-        steps: Of each training.
-        workers: Trainings at a time, of one thread each; default: one a core.
-        output: Folder for all of it.
+        suite: quick (a few conditions, 15 minutes) or full (all, one to two hours).
+        methods: Names in conf/stability.yaml, such as hashgrid "2D mlp"; default: all, with controls that must fail.
+        seeds: Seeds per condition and method.
+        steps: Steps per training.
+        workers: Parallel trainings, of one thread each; default: one per core.
+        output: Folder for all files.
 
     Returns:
-        What stability.json holds: `suite`, `summary` in sentences, and `cells` (an outcome for each training).
+        The content of stability.json: `suite`, `summary` in sentences, and `cells` (a result per training).
 
     Raises:
-        InputError: where a method is not known, or another process writes into the folder.
+        InputError: an unknown method, or another process writes into the folder.
     """
     from nerf_lightning.runs.run_lock import lock_folder
     from nerf_lightning.stability.conditions import CONDITIONS, METHODS
@@ -50,7 +50,7 @@ def stability(
     unknown = [name for name in chosen if name not in METHODS]
     if unknown or not chosen:
         raise InputError("stability", "methods", ", ".join(unknown) or "none", f"some of {', '.join(METHODS)}")
-    conditions = [one.name for one in CONDITIONS.values() if suite == "full" or one.quick]
+    conditions = [condition.name for condition in CONDITIONS.values() if suite == "full" or condition.quick]
     trials, root = list_trials(conditions, chosen, seeds, steps), check_output_path(output)
     with lock_folder(root):
         done = run_trials(trials, root, min(workers or available_cores(), len(trials)))

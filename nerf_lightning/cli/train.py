@@ -1,4 +1,4 @@
-"""nerf_lightning train: Hydra's command line. Imports nothing heavy."""
+"""nerf_lightning train: Hydra's command line. Fast to import."""
 
 import os
 import re
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
 
 
 def is_override(word: str) -> bool:
-    """Whether a command line's first word is for Hydra: KEY=VALUE, +KEY=VALUE, ~KEY, or one of its flags."""
+    """Whether a command line's first word is Hydra's: KEY=VALUE, +KEY=VALUE, ~KEY, or one of its flags."""
     if word in ("-h", "--help", "--version", "--install-completion"):
         return False
     return word.startswith(("+", "~", "-")) or re.match(r"[\w./@]+=", word) is not None
 
 
 def describe_groups() -> str:
-    """The options of the groups that users choose most, a line a group."""
+    """The options of the main config groups, one line per group."""
     lines = []
     for group in ("dataset", "model", "sampler", "refine", "recipe", "experiment"):
         names = ", ".join(sorted(file.stem for file in (conf_dir() / group).glob("*.yaml")))
@@ -38,7 +38,7 @@ def describe_groups() -> str:
 def train(*overrides: Annotated[str, Parameter(allow_leading_hyphen=True, show=False)]) -> None:
     """Train a field from photos, or from a single image.
 
-    train dataset=photos dataset.path=SCENE    for 90 s; then view, or export html
+    train dataset=photos dataset.path=SCENE    90 s by default; then view, or export html
     train +experiment=lego                     the Lego scene, or built-in bricks
     train +experiment=picture                  a single image: dataset.path=IMAGE
 
@@ -47,11 +47,11 @@ def train(*overrides: Annotated[str, Parameter(allow_leading_hyphen=True, show=F
     Blender (transforms_train.json), COLMAP (sparse/0), LLFF (poses_bounds.npy); or
     FILE.npz, as capture writes it
 
-    budget.seconds=60   for a minute; or budget.steps=1000
-    model=mlp           another field; recipe=NAME brings settings that suit it
+    budget.seconds=60   training time; or budget.steps=1000
+    model=mlp           another field; recipe=NAME selects a tuned preset
     seed=1 name=mine    results go to outputs/mine/TIME
-    resume=RUN          continue a run that was interrupted
-    -m seed=0,1,2       a sweep: a run for each value; run again, it continues
+    resume=RUN          continue an interrupted run
+    -m seed=0,1,2       a sweep: one run per value; if interrupted, the same command continues
     hydra.run.dir=DIR   the run's folder; overwrite=true replaces a run in it
     --cfg job           all keys with their values
 
@@ -64,7 +64,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
     """Composes the configuration from a command line and trains.
 
     Raises:
-        InputError: for what the user can mend.
+        InputError: invalid overrides or options.
     """
     import hydra
     from hydra._internal.utils import get_args_parser
@@ -81,7 +81,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
         try:
             runtime: Any = HydraConfig.get().runtime
             plain: Any = OmegaConf.to_container(runtime)
-            with read_write(runtime):  # Hydra does not escape the path that it puts there
+            with read_write(runtime):  # Hydra does not escape this path
                 runtime.output_dir = escape_interpolations(plain["output_dir"])
             return train_job(cfg)
         except Exception as error:
@@ -89,7 +89,7 @@ def run_hydra(overrides: Sequence[str]) -> None:
             if known is None:
                 raise
             remove_empty_folders(Path(HydraConfig.get().runtime.output_dir))
-            exit_with_error(known)  # here, as Hydra would print a line of its own
+            exit_with_error(known)  # exit here: Hydra would print its own message
 
     def refuse(message: str) -> None:
         raise InputError("command line", "", message, hint="give KEY=VALUE, or flags that --hydra-help lists")
@@ -98,14 +98,14 @@ def run_hydra(overrides: Sequence[str]) -> None:
     parser.allow_abbrev = False  # --experiment is not --experimental-rerun
     parser.error = refuse  # type: ignore[method-assign,assignment]
     flags = parser.parse_args(list(overrides))
-    if flags.experimental_rerun:  # it unpickles a file, which may run anything
+    if flags.experimental_rerun:  # unpickles a file, which may execute code
         refuse("--experimental-rerun")
     for word in flags.overrides:
         if ("=" not in word and not word.startswith("~")) or os.path.exists(word):
             hint = f"to train on photos: dataset=photos {shlex.quote(f'dataset.path={word}')}"
             raise InputError("command line", "", word, "KEY=VALUE", hint)
     sys.argv[1:] = rewrite_overrides(overrides, flags.multirun)
-    os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra then raises, instead of printing a report and exiting with 1
+    os.environ["HYDRA_FULL_ERROR"] = "1"  # makes Hydra raise instead of printing and exiting with 1
     try:
         hydra.main(version_base="1.3", config_path=str(conf_dir()), config_name="config")(job)()
     except (HydraException, OmegaConfBaseException) as error:
@@ -116,10 +116,10 @@ def train_job(cfg: "DictConfig") -> float | None:
     """Trains one run, or one job of a sweep.
 
     Returns:
-        Held-out PSNR in dB, which a sweep optimises; None for a sweep's job that failed.
+        Held-out PSNR in dB, the objective of a sweep; None for a failed job of a sweep.
 
     Raises:
-        InputError: as `training.train.train`, and where the folder belongs to another run.
+        InputError: as `training.train.train`, and if the folder holds another run.
     """
     from hydra.core.hydra_config import HydraConfig
     from hydra.types import RunMode
@@ -145,7 +145,7 @@ def train_job(cfg: "DictConfig") -> float | None:
                 return train_run(cfg)
         timed = "${now:" in str(OmegaConf.to_container(hydra.run, resolve=False))
         with lock_new_run_folder(folder, cfg.overwrite, allow_suffix=timed) as folder:
-            with read_write(hydra):  # further processes of this run ask Hydra
+            with read_write(hydra):  # other processes of this run read it
                 hydra.run.dir = hydra.runtime.output_dir = escape_interpolations(str(folder))
             return train_run(cfg)
     except SignalInterrupt as interrupted:
@@ -156,11 +156,12 @@ def train_job(cfg: "DictConfig") -> float | None:
 
 
 def rewrite_overrides(words: Sequence[str], sweep: bool) -> list[str]:
-    """A command line as Hydra must be given it: groups set to null, files of experiments, `~`, and text of any letters. One
-    that resumes a run continues in that run's folder and may set any of that run's options.
+    """Rewrites a command line into Hydra's grammar: null groups, experiment files, `~`, and quoting.
+
+    A resumed run continues in its folder and may override any of its options.
 
     Raises:
-        InputError: for a group that no run can do without, an experiment that is no YAML, and a run that is not there.
+        InputError: null for a required group, an invalid experiment file, or a missing run.
     """
     from nerf_lightning.config.options import replace_nulls
     from nerf_lightning.config.quoting import FOLDER_KEYS, make_override, quote_overrides
@@ -171,12 +172,12 @@ def rewrite_overrides(words: Sequence[str], sweep: bool) -> list[str]:
     for word in replace_nulls(words):
         key, _, value = word.partition("=")
         if key == "+experiment" and value.endswith(".yaml") and (file := expand_user_path(value)).is_file():
-            read_yaml(file, "an experiment in YAML")  # Hydra reads without limits
+            read_yaml(file, "an experiment in YAML")  # Hydra reads without a size limit
             word = make_override(key, os.path.relpath(file.with_suffix(""), conf_dir() / "experiment"))
         elif key in FOLDER_KEYS and value.startswith("~"):
             word = make_override(key, expand_user_path(value))
         elif resumes and re.match(r"(?!hydra\.)\w+\.[\w.]+=", word):
-            word = f"++{word}"  # conf/ composes another run: this sets also what only the resumed one has
+            word = f"++{word}"  # adds keys that only the resumed run has
         rewritten.append(word)
     if resumes:
         folder = expand_user_path(resumes[-1].removeprefix("resume="))
@@ -187,13 +188,13 @@ def rewrite_overrides(words: Sequence[str], sweep: bool) -> list[str]:
 
 
 def translate_error(error: Exception) -> InputError:
-    """An error of Hydra or OmegaConf as bad input, with the nearest key where one is not known."""
+    """Converts an error of Hydra or OmegaConf to an InputError; suggests the closest key for an unknown one."""
     line = " ".join(str(error).split("Config search path")[0].split())
     if (unknown := re.match(r"Could not override '([^']+)'", line)) is not None:
         node = getattr(error.__cause__, "parent_node", None)
         known = [str(key) for key in node] if node is not None else []
         parent, dot, key = unknown[1].rpartition(".")
-        hint = suggest(key, known, parent + dot) or "--cfg job lists all"
+        hint = suggest(key, known, parent + dot) or "--cfg job lists all keys"
         return InputError("command line", unknown[1], "an unknown key", f"one of {', '.join(sorted(known))}", hint)
     if re.search(r"hydra/(launcher|sweeper)", line):
         line += "; joblib, submitit_local, submitit_slurm and optuna come with pip install 'nerf_lightning[sweeps]'"

@@ -1,4 +1,4 @@
-"""Recommendations in words, and what weakens them."""
+"""Recommendations and caveats of a comparison, as sentences."""
 
 from typing import Any
 
@@ -9,16 +9,16 @@ from nerf_lightning.comparison.points import format_bytes, round_cost
 from nerf_lightning.utils.machine import MAX_BACKGROUND_LOAD
 
 MIN_SEEDS = 3
-"""Runs below which a point on a frontier may be luck."""
+"""Number of runs below which a point on a frontier may be chance."""
 
 
 def recommend(points: pd.DataFrame, within_db: float, seconds: float) -> list[str]:
-    """Sentences about the points of one comparison, one for each point that is best at something.
+    """Recommends points of a comparison: one sentence per point that is best, fastest or smallest.
 
     Args:
-        points: of `compute_points`, the best first.
-        within_db: how far below the best the fastest and the smallest may be, dB.
-        seconds: a budget of training time.
+        points: from `compute_points`, best first.
+        within_db: allowed loss of the fastest and the smallest against the best, dB.
+        seconds: budget of training time.
     """
     best, costs = points["psnr"].max(), points["train_seconds"].map(round_cost)
     choices = {
@@ -48,13 +48,13 @@ def describe_point(point: Any) -> str:
 
 
 def list_caveats(points: pd.DataFrame) -> list[str]:
-    """What weakens a comparison: a busy machine, few seeds."""
+    """Caveats of a comparison: background load, few seeds."""
     caveats = []
     busy = points[points["background_load"] > MAX_BACKGROUND_LOAD]
     if len(busy):
         caveats.append(
-            f"The machine ran other work, which took up to {busy['background_load'].max():.0%} of the threads: seconds"
-            f" are too long of {', '.join(busy['label'])}. Delete those runs and repeat them."
+            f"Other processes used up to {busy['background_load'].max():.0%} of the threads: timings are too long"
+            f" of {', '.join(busy['label'])}. Delete those runs and repeat them."
         )
     few = points[(points["frontier"] != "") & (points["runs"].map(len) < MIN_SEEDS)]
     if len(few):

@@ -1,4 +1,4 @@
-"""Panels of one comparison: PSNR by configuration and against each cost."""
+"""Charts of a comparison: PSNR by configuration and against each cost."""
 
 import numpy as np
 import pandas as pd
@@ -21,17 +21,17 @@ from nerf_lightning.drawing.style import (
 )
 
 PANEL_WIDTH_IN, PANEL_HEIGHT_IN, DPI = 4.8, 3.5, 172
-"""Of a panel, in inches, and pixels per inch."""
+"""Panel size in inches, and pixels per inch."""
 MAX_LABELS = 8
-"""Points that are named each, and have a colour each; of more, those on the frontier are named, and methods have colours."""
+"""Up to this many points, each has a label and colour; beyond, only the frontier is labelled and colours mark methods."""
 MAX_ROWS = 12
-"""Configurations in the panel of qualities, the best."""
+"""Configurations in the quality panel."""
 MAX_PUBLISHED_TIME_RATIO = 30.0
-"""How many times the longest training of one's own the axis reaches, where publications took longer."""
+"""Upper end of the time axis for publications, relative to the longest training of the runs."""
 
 
 def draw_panels(points: pd.DataFrame, references: pd.DataFrame) -> list[UInt8[np.ndarray, "_ _ 3"]]:
-    """The panel of qualities, then one for each cost that is known."""
+    """Draws the quality panel, then one per known cost."""
     kind = "label" if len(points) <= MAX_LABELS else "method"
     styles = assign_styles(sorted(points[kind]))
     points = points.assign(style=[styles[name] for name in points[kind]])
@@ -51,14 +51,14 @@ def make_panel(title: str) -> tuple[Figure, Axes]:
 
 
 def draw_quality(points: pd.DataFrame) -> Figure:
-    """A row for each configuration, the best on top: its median, and a stroke for each seed."""
+    """Plots the PSNR of each configuration, best first: median, and a tick per seed."""
     shown = points.head(MAX_ROWS)
     figure, axes = make_panel("Quality" if len(shown) == len(points) else f"Quality of the best {MAX_ROWS}")
     for row, point in enumerate(shown.itertuples()):
-        colour, marker = point.style
+        color, marker = point.style
         seeds = [run.psnr for run in point.runs if run.status != "collapsed"]
-        axes.plot(seeds, [row] * len(seeds), "|", color=colour, markersize=12)
-        axes.plot(point.psnr, row, marker, color=colour, markersize=8, markeredgecolor="white")
+        axes.plot(seeds, [row] * len(seeds), "|", color=color, markersize=12)
+        axes.plot(point.psnr, row, marker, color=color, markersize=8, markeredgecolor="white")
         axes.annotate(f"{point.psnr:.2f}", (point.psnr_max, row), (8, -3), textcoords="offset points", fontsize=8)
     axes.set_yticks(
         range(len(shown)),
@@ -74,20 +74,20 @@ def draw_quality(points: pd.DataFrame) -> Figure:
 
 
 def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figure:
-    """PSNR against a cost: bars from the worst to the best seed, the frontier, PSNR on the way; publications are hollow."""
+    """Plots PSNR against a cost: seed range, Pareto frontier and training curves; publications are hollow."""
     figure, axes = make_panel(f"Quality against {COSTS[cost].split(',')[0]}")
     placed, training = points[points[cost].notna()], cost == "train_seconds"
     texts: list[Text] = []
     xs: list[float] = placed[cost].tolist()
     front = placed[[cost in costs.split() for costs in placed["frontier"]]].sort_values([cost, "psnr"])
     for point in placed.itertuples():
-        colour, marker = point.style
+        color, marker = point.style
         x = getattr(point, cost)
         edge, low = (VERMILLION, point.psnr) if point.collapsed else ("white", point.psnr_min)
-        axes.plot([x, x], [low, point.psnr_max], color=colour, linewidth=1.5)
-        axes.scatter([x], [point.psnr], 55, colour, marker=marker, edgecolor=edge, linewidth=0.6, zorder=4)
+        axes.plot([x, x], [low, point.psnr_max], color=color, linewidth=1.5)
+        axes.scatter([x], [point.psnr], 55, color, marker=marker, edgecolor=edge, linewidth=0.6, zorder=4)
         if len(points) <= MAX_LABELS or point.Index in front.index:
-            texts.append(add_label(axes, point.label, x, point.psnr, colour))
+            texts.append(add_label(axes, point.label, x, point.psnr, color))
     reach, label = MAX_PUBLISHED_TIME_RATIO * placed[cost].max(), "published, other hardware"
     for one in references.itertuples() if training else ():
         x, inside = min(one.seconds, reach), one.seconds <= reach
@@ -106,8 +106,8 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
     if len(front) > 1:
         axes.plot(front[cost], front["psnr"], drawstyle="steps-post", color="0.4", linewidth=1, label="Pareto frontier")
     if len(points) > MAX_LABELS:
-        for method, (colour, marker) in dict(zip(placed["method"], placed["style"], strict=True)).items():
-            axes.plot([], [], marker, color=colour, label=replace_missing_glyphs(method))
+        for method, (color, marker) in dict(zip(placed["method"], placed["style"], strict=True)).items():
+            axes.plot([], [], marker, color=color, label=replace_missing_glyphs(method))
     axes.set(xlabel=COSTS[cost], ylabel="held-out PSNR, dB")
     scale_costs(axes, cost, xs)
     if axes.get_legend_handles_labels()[0]:
@@ -117,7 +117,7 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
 
 
 def scale_costs(axes: Axes, cost: str, values: list[float]) -> None:
-    """A logarithmic axis where costs differ by much, with few round ticks."""
+    """Sets few round ticks, and a log scale if costs differ by more than a factor of 8."""
     ratio = max(values) / min(values)
     if ratio > 8:
         axes.set_xscale("log")
@@ -130,9 +130,9 @@ def scale_costs(axes: Axes, cost: str, values: list[float]) -> None:
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: write(value)))
 
 
-def add_label(axes: Axes, name: str, x: float, y: float, colour: str) -> Text:
+def add_label(axes: Axes, name: str, x: float, y: float, color: str) -> Text:
     text = axes.text(
-        x, y, shorten(replace_missing_glyphs(name), 34), color=colour, fontsize=8, zorder=6, parse_math=False
+        x, y, shorten(replace_missing_glyphs(name), 34), color=color, fontsize=8, zorder=6, parse_math=False
     )
     text.set_path_effects([withStroke(linewidth=2, foreground="white")])
     return text

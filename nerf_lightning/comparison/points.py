@@ -1,4 +1,4 @@
-"""Runs of one configuration, over their seeds, as one point: a row of a table."""
+"""Aggregation of runs over seeds: one point (table row) per configuration."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,35 +13,34 @@ from nerf_lightning.utils.machine import background_load
 from nerf_lightning.utils.parsing import read_yaml
 
 COSTS = {"train_seconds": "training time, s", "render_seconds": "rendering time, s per view", "bytes": "size"}
-"""Columns against which PSNR is charted."""
+"""Cost columns and their axis labels."""
 IGNORED_OPTIONS = ("callbacks", "logger", "resume", "name", "method", "recipe", "threads", "device")
-"""Options that do not change what is trained, or that repeat others."""
+"""Options that do not affect training, or that repeat others."""
 IGNORED_NAMES = ("seed", "path", "folder", "url", "download", "accelerator")
-"""Last parts of options that differ between runs of one configuration, or belong to the conditions."""
+"""Last key parts of options that differ between runs of one configuration, or belong to the conditions."""
 BACKGROUNDS = {"[0.0, 0.0, 0.0]": "black background", "[1.0, 1.0, 1.0]": "white background"}
-
 PUBLISHED_FILE = Path(__file__).with_name("published.yaml")
-"""Published figures, to stand beside one's own: never measured here, and always drawn as such."""
+"""Published results, for comparison; never measured here."""
 REFERENCES_FORMAT = (
     "publications as in published.yaml: source, hardware, conditions, scenes: {SCENE: {METHOD: [dB, seconds]}}"
 )
 
 
 class Conditions(NamedTuple):
-    """What two runs must share before their figures can stand on one axis; what is not known is called so."""
+    """Conditions that runs must share to be comparable."""
 
     scene: str
     resolution: str
     views: str
-    """"" for an image, which is all there is."""
+    """Empty for an image."""
     background: str
     machine: str
     fingerprint: str
-    """First letters of the SHA-256 of the images and their split."""
+    """Prefix of the SHA-256 of the images and their split."""
 
 
 def get_conditions(run: RunSummary) -> Conditions:
-    """A run's conditions, from its results.json."""
+    """The conditions of a run, from its results.json."""
     parts = (run.results.get("scene"), run.results.get("machine"))
     scene, machine = (part if isinstance(part, dict) else {} for part in parts)
     size, views, background = scene.get("resolution"), scene.get("views"), run.results.get("background")
@@ -60,15 +59,15 @@ def get_conditions(run: RunSummary) -> Conditions:
 
 
 def compute_points(runs: Sequence[RunSummary]) -> list[tuple[Conditions, pd.DataFrame]]:
-    """Groups runs by their conditions and configuration, those with most points first.
+    """Aggregates runs by conditions and configuration; largest groups first.
 
-    Columns: label, method, psnr (dB, median over runs, a collapsed one counting as minus infinity), psnr_min, psnr_max, the
-    medians train_seconds, render_seconds and bytes (nan where unknown), collapsed (how many), background_load (see
-    `utils/machine`), options, runs, and the costs of whose frontier a point is. Sorted by falling PSNR. A configuration of
-    which half of the runs or more collapsed makes no point, nor do runs without a figure.
+    Columns: label, method, psnr (dB, median over runs; -inf for collapsed ones), psnr_min, psnr_max, the medians of
+    train_seconds, render_seconds and bytes (NaN if unknown), collapsed (count), background_load (see `utils/machine`),
+    options, runs, and frontier (costs). Sorted by descending PSNR. Configurations with half or more of their runs collapsed,
+    and runs without metrics, are left out.
     """
     table = pd.DataFrame([make_record(run) for run in runs if has_metrics(run)])
-    found = []
+    groups = []
     for conditions, group in table.groupby("conditions") if len(table) else ():
         points = group.groupby("key", sort=False).agg(
             label=("label", "first"),
@@ -87,17 +86,17 @@ def compute_points(runs: Sequence[RunSummary]) -> list[tuple[Conditions, pd.Data
             points = points.reset_index(drop=True).assign(label=name_points(points))
             fronts = {cost: find_frontier(points[cost].map(round_cost), points["psnr"]) for cost in COSTS}
             points["frontier"] = [" ".join(cost for cost in COSTS if i in fronts[cost]) for i in points.index]
-            found.append((Conditions(*conditions), points))
-    return sorted(found, key=lambda pair: -len(pair[1]))
+            groups.append((Conditions(*conditions), points))
+    return sorted(groups, key=lambda pair: -len(pair[1]))
 
 
 def has_metrics(run: RunSummary) -> bool:
-    """Whether a run can be compared."""
+    """Whether a run has PSNR and training time."""
     return run.psnr is not None and (run.get_metric("train_seconds") or 0) > 0
 
 
 def make_record(run: RunSummary) -> dict[str, Any]:
-    """A run as a row."""
+    """A run as a table row."""
     method, options = str(run.results.get("method") or run.get_option("method")), collect_options(run)
     return {
         "run": run,
@@ -115,7 +114,7 @@ def make_record(run: RunSummary) -> dict[str, Any]:
 
 
 def collect_options(run: RunSummary) -> dict[str, Any]:
-    """The options that shape a run's result, with dotted keys; the folder stands for them where they cannot be read."""
+    """Options that affect a run's result, by dotted key; its folder if they are unreadable."""
     plain = {key: value for key, value in run.config.items() if key not in IGNORED_OPTIONS}
     options = {
         key: value for key, value in flatten_config(plain).items() if key.rsplit(".", 1)[-1] not in IGNORED_NAMES
@@ -124,25 +123,25 @@ def collect_options(run: RunSummary) -> dict[str, Any]:
 
 
 def name_points(points: pd.DataFrame) -> list[str]:
-    """Labels: recipe or method, then the options that tell it from others of that name."""
+    """Labels: recipe or method, then the options that distinguish it from others of that name."""
     names = []
     for label, mine in zip(points["label"], points["options"], strict=True):
         alike = points.loc[points["label"] == label, "options"]
-        apart = [key for key in mine if any(other.get(key) != mine[key] for other in alike)]
-        told = [key for key in apart if mine[key] is not None and not key.endswith("_target_")]
-        names.append(", ".join([label, *(f"{key.rsplit('.', 1)[-1]} {mine[key]}" for key in told)]))
+        varying = [key for key in mine if any(other.get(key) != mine[key] for other in alike)]
+        shown = [key for key in varying if mine[key] is not None and not key.endswith("_target_")]
+        names.append(", ".join([label, *(f"{key.rsplit('.', 1)[-1]} {mine[key]}" for key in shown)]))
     return names
 
 
 def round_cost(value: float) -> float:
-    """A cost to two significant figures: what differs by less is noise of the clock (5.01 s and 5.03 s are both 5.0)."""
+    """Rounds a cost to two significant figures, below which timings are noise."""
     return float(f"{value:.1e}")
 
 
 def find_frontier(costs: pd.Series, gains: pd.Series) -> pd.Index:
-    """The Pareto frontier: points to which no other is at least equal in both respects and better in one, by rising cost.
+    """The Pareto frontier: indices of points that no other dominates, by rising cost.
 
-    Points that are equal in both are all on it; those of unknown cost are not.
+    Includes ties; excludes points of unknown cost.
     """
     table = pd.DataFrame({"cost": costs, "gain": gains}).dropna().sort_values(["cost", "gain"], ascending=[True, False])
     best_so_far = table["gain"] == table["gain"].cummax()
@@ -151,7 +150,7 @@ def find_frontier(costs: pd.Series, gains: pd.Series) -> pd.Index:
 
 
 def find_median_run(point: Any) -> RunSummary:
-    """The run nearest to a point's median."""
+    """The run whose PSNR is closest to a point's median."""
     return min(point.runs, key=lambda run: abs(run.psnr - point.psnr))
 
 
@@ -160,10 +159,10 @@ def format_bytes(size: float) -> str:
 
 
 def read_references(file: Path) -> pd.DataFrame:
-    """Reads a YAML file of publications: a row for each method, with name, psnr, seconds (of training), scene and origin.
+    """Reads a YAML file of publications into rows of name, psnr, seconds (of training), scene and origin.
 
     Raises:
-        InputError: where it cannot be read, or an entry lacks something or has an impossible value.
+        InputError: an unreadable file, or a missing or invalid value.
     """
     publications, rows = read_yaml(file, REFERENCES_FORMAT), []
     try:

@@ -1,4 +1,4 @@
-"""Everything a comparison leaves behind: compare.html, compare.png, compare.csv and the same on the terminal."""
+"""Output of a comparison: compare.html, compare.png, compare.csv and a terminal table."""
 
 import os
 from collections.abc import Sequence
@@ -30,24 +30,24 @@ from nerf_lightning.utils.files import atomic_write, write_text
 from nerf_lightning.utils.html import relative_url, render_page
 
 SHEET_WIDTH_PX, MAX_IMAGE_SIDE_PX = 1720, 480
-"""Width of compare.png, and longest side of an image."""
+"""Width of compare.png, and longest side of an image, pixels."""
 MAX_IMAGES = 11
 MAX_COMPARISONS, MAX_FAILURES = 4, 24
-"""In compare.png; the page and the table have all."""
+"""Limits for compare.png; the page and the table have all."""
 HEADINGS = ("dB", "worst", "train s", "view s", "size", "runs", "frontier")
 CAPTION = "dB: median over seeds; frontier: by T(raining time), R(endering time), S(ize)"
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Points that were made under the same conditions, and what to say about them."""
+    """Points under the same conditions, with advice and charts."""
 
     conditions: Conditions
     points: pd.DataFrame
     """See `compute_points`."""
     advice: list[str]
     caveats: list[str]
-    """Caveats, and where published figures are from."""
+    """Caveats, and sources of published results."""
     panels: list[UInt8[np.ndarray, "_ _ 3"]]
     images: list[tuple[str, UInt8[np.ndarray, "_ _ 3"]]]
 
@@ -67,10 +67,10 @@ def write_comparison(
     within_db: float = 0.5,
     seconds: float = 15.0,
 ) -> pd.DataFrame:
-    """Compares runs, writes compare.html, compare.png and compare.csv into a folder, and prints table and advice.
+    """Compares runs; writes compare.html, compare.png and compare.csv, and prints table and advice.
 
     Returns:
-        The table: a row for each point, then one for each run that is in none.
+        The table: a row per point, then one per run that is in none.
     """
     comparisons = []
     for conditions, points in compute_points(runs):
@@ -90,20 +90,20 @@ def write_comparison(
 
 
 def list_failures(runs: Sequence[RunSummary]) -> list[str]:
-    """A line for each run that did not end well, with its folder as seen from the one that holds all runs."""
+    """A line per failed run, with its folder relative to the common parent."""
     common = os.path.commonpath([run.folder.absolute().parent for run in runs])
     bad = [run for run in runs if run.status not in ("finished", "stopped_early") or not has_metrics(run)]
     return [f"{os.path.relpath(run.folder, common)}: {run.status}: {run.diagnosis}".rstrip(": ") for run in bad]
 
 
 def tabulate(comparisons: Sequence[Comparison], runs: Sequence[RunSummary]) -> pd.DataFrame:
-    """What compare.csv holds."""
+    """The table of compare.csv."""
     tables, charted = [], set()
-    for one in comparisons:
-        folders = [[str(run.folder) for run in some] for some in one.points["runs"]]
-        ends = {"runs": [*map(len, folders)], **one.conditions._asdict(), "folders": [*map(";".join, folders)]}
-        tables.append(one.points.drop(columns="options").assign(**ends, status="compared"))
-        charted |= {folder for some in folders for folder in some}
+    for comparison in comparisons:
+        folders = [[str(run.folder) for run in runs_of_point] for runs_of_point in comparison.points["runs"]]
+        ends = {"runs": [*map(len, folders)], **comparison.conditions._asdict(), "folders": [*map(";".join, folders)]}
+        tables.append(comparison.points.drop(columns="options").assign(**ends, status="compared"))
+        charted |= {folder for runs_of_point in folders for folder in runs_of_point}
     left_out = [run for run in runs if str(run.folder) not in charted]
     rows = [(run.folder.name, str(run.folder), run.status, run.diagnosis) for run in left_out]
     table = pd.concat([*tables, pd.DataFrame(rows, columns=["label", "folders", "status", "diagnosis"])])
@@ -111,36 +111,38 @@ def tabulate(comparisons: Sequence[Comparison], runs: Sequence[RunSummary]) -> p
 
 
 def collect_images(points: pd.DataFrame) -> list[tuple[str, UInt8[np.ndarray, "H W 3"]]]:
-    """Captions and images of a held-out view, the truth first, then of the best points as far as they have one."""
-    found: list[tuple[str, UInt8[np.ndarray, "H W 3"]]] = []
+    """Captions and images of a held-out view: ground truth first, then the best points that have one."""
+    images: list[tuple[str, UInt8[np.ndarray, "H W 3"]]] = []
     for point in points.head(MAX_IMAGES).itertuples():
         run = find_median_run(point)
         for name, caption in (("truth", "truth"), ("final", f"{point.label}\n{run.psnr:.2f} dB")):
-            with suppress(InputError):  # there is none, or it cannot be read
-                if name == "final" or not found:
+            with suppress(InputError):  # missing or unreadable
+                if name == "final" or not images:
                     image = read_pixels(run.folder / f"{name}.png")[..., :3]
-                    found.append((caption, fit_image(image, MAX_IMAGE_SIDE_PX, MAX_IMAGE_SIDE_PX)))
-    return found
+                    images.append((caption, fit_image(image, MAX_IMAGE_SIDE_PX, MAX_IMAGE_SIDE_PX)))
+    return images
 
 
 def draw_figure(comparisons: Sequence[Comparison], failures: Sequence[str]) -> UInt8[np.ndarray, "H W 3"]:
-    """Panels, images and words of all comparisons, one below the other."""
+    """Draws panels, images and advice of all comparisons below each other."""
     parts = []
-    for one in comparisons[:MAX_COMPARISONS]:
-        words = "\n".join([one.title, one.details, *one.advice, *one.caveats])
-        captions, images = [caption for caption, _ in one.images], [image for _, image in one.images]
+    for comparison in comparisons[:MAX_COMPARISONS]:
+        heading = "\n".join([comparison.title, comparison.details, *comparison.advice, *comparison.caveats])
+        captions, images = [caption for caption, _ in comparison.images], [image for _, image in comparison.images]
         parts.append(
-            make_contact_sheet(one.panels, [""] * len(one.panels), 2, SHEET_WIDTH_PX, heading=words, text_px=12)
+            make_contact_sheet(
+                comparison.panels, [""] * len(comparison.panels), 2, SHEET_WIDTH_PX, heading=heading, text_px=12
+            )
         )
         parts.append(make_contact_sheet(images, captions, 6, SHEET_WIDTH_PX, text_px=18))
     if failures:
-        words = "\n".join([f"Failed, collapsed or cut short ({len(failures)}):", *failures[:MAX_FAILURES]])
-        parts.append(make_contact_sheet([], [], 1, SHEET_WIDTH_PX, heading=words, text_px=12))
+        heading = "\n".join([f"Failed, collapsed or cut short ({len(failures)}):", *failures[:MAX_FAILURES]])
+        parts.append(make_contact_sheet([], [], 1, SHEET_WIDTH_PX, heading=heading, text_px=12))
     return np.concatenate(parts)
 
 
 def render_comparison_page(comparisons: Sequence[Comparison], failures: Sequence[str], folder: Path) -> str:
-    """The page in a folder: rows link to the turnable page of a run, where it has one."""
+    """Renders compare.html for a folder; rows link to a run's interactive page if it exists."""
 
     def find_page(point: Any) -> str | None:
         page = find_median_run(point).folder / FIELD_PAGE
@@ -153,7 +155,7 @@ def render_comparison_page(comparisons: Sequence[Comparison], failures: Sequence
 
 
 def fill_cells(point: Any) -> list[str]:
-    """A point's row below `HEADINGS`."""
+    """The table cells of a point, as in `HEADINGS`."""
     return [
         f"{point.psnr:.2f}",
         "collapsed" if np.isinf(point.psnr_min) else f"{point.psnr_min:.2f}",
@@ -166,10 +168,16 @@ def fill_cells(point: Any) -> list[str]:
 
 
 def print_comparisons(comparisons: Sequence[Comparison], failures: Sequence[str]) -> None:
-    """The same on the terminal."""
-    for one in comparisons:
-        cells = [[point.label, *fill_cells(point)] for point in one.points.itertuples()]
+    for comparison in comparisons:
+        cells = [[point.label, *fill_cells(point)] for point in comparison.points.itertuples()]
         table = pd.DataFrame(cells, columns=["", *HEADINGS]).to_string(index=False)
-        print(f"{one.title}; {one.details}", table, CAPTION, *one.advice, *one.caveats, sep="\n")
+        print(
+            f"{comparison.title}; {comparison.details}",
+            table,
+            CAPTION,
+            *comparison.advice,
+            *comparison.caveats,
+            sep="\n",
+        )
     if failures:
         print("Failed, collapsed or cut short:", *failures, sep="\n")

@@ -1,1 +1,1 @@
-"""How good a trained run is, view by view, on its own photos or on others."""
+"""Per-view image quality of a trained run."""

@@ -1,4 +1,4 @@
-"""Quality of each view, as a table and as plain values. LPIPS needs weights that are on this machine: nothing is downloaded."""
+"""PSNR, SSIM and LPIPS of each view. LPIPS needs local weights: nothing is downloaded."""
 
 import importlib
 import math
@@ -18,17 +18,17 @@ from nerf_lightning.utils.machine import describe_machine
 from nerf_lightning.utils.progress import track_progress
 
 TABLE_DECIMALS = {"psnr": 2, "ssim": 4, "lpips": 4, "seconds": 3}
-"""Decimals of a view's figures. SSIM is nan for views smaller than its window, LPIPS where it cannot be computed."""
+"""Decimals of each metric. SSIM is NaN for views smaller than its window, LPIPS where it is unavailable."""
 ALEXNET_WEIGHTS = "alexnet-owt-7be5be79.pth"
-"""As torchvision names them in torch.hub's folder."""
+"""torchvision's file in torch.hub's folder."""
 MIN_LPIPS_SIDE = 64
-"""Pixels along a side that AlexNet needs."""
+"""Minimum side of an image for AlexNet, pixels."""
 
 
 def measure_views(
     system: System, data: RayDataModule | PixelDataModule, worst: int
 ) -> tuple[pd.DataFrame, dict[int, ViewResult]]:
-    """The figures of all held-out views, and the results of the worst ones by their number."""
+    """Metrics of all held-out views, and results of the `worst` worst ones by view index."""
     lpips, rows = load_lpips(), []
     results: dict[int, ViewResult] = {}
     views = track_progress(range(data.num_held_out_views), data.num_held_out_views, "held-out views")
@@ -36,19 +36,19 @@ def measure_views(
         rows.append((result.psnr, result.ssim, lpips(result.rgb, result.masked_truth), result.seconds))
         results[view] = result
         if len(results) > worst:
-            del results[max(results, key=lambda one: results[one].psnr)]
+            del results[max(results, key=lambda view: results[view].psnr)]
     return pd.DataFrame(rows, columns=list(TABLE_DECIMALS), dtype=float), results
 
 
 def load_lpips() -> Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], float]:
-    """LPIPS (Zhang et al. 2018) with AlexNet of two images in [0, 1], smaller is better; nan for images that are too small.
+    """Loads LPIPS (Zhang et al. 2018) with AlexNet, for two images in [0, 1]; lower is better, NaN for images too small.
 
-    Without torchvision or the weights it is nan for all, and a line says why.
+    Without torchvision or weights it returns NaN, and one line is printed.
     """
     weights, reason = Path(torch.hub.get_dir()) / "checkpoints" / ALEXNET_WEIGHTS, ""
     try:
         importlib.import_module("torchvision")
-        reason = "" if weights.exists() else f"{weights} is not there"
+        reason = "" if weights.exists() else f"{weights} does not exist"
     except ImportError:
         reason = "torchvision is not installed: pip install 'nerf_lightning[lpips]'"
     if reason:
@@ -57,14 +57,14 @@ def load_lpips() -> Callable[[Float[Tensor, "H W 3"], Float[Tensor, "H W 3"]], f
     def lpips(image: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"]) -> float:
         if reason or min(image.shape[:2]) < MIN_LPIPS_SIDE:
             return math.nan
-        first, second = (one.permute(2, 0, 1)[None] for one in (image, truth))
+        first, second = (x.permute(2, 0, 1)[None] for x in (image, truth))
         return float(learned_perceptual_image_patch_similarity(first, second, net_type="alex", normalize=True))
 
     return lpips
 
 
 def format_table(views: pd.DataFrame) -> str:
-    """All views, the worst marked, and their means."""
+    """Formats the metrics of all views and their means, with the worst view marked."""
     rows = pd.concat([views, views.mean(skipna=False).to_frame("mean").T])
     table = pd.DataFrame({name: rows[name].map(f"{{:.{digits}f}}".format) for name, digits in TABLE_DECIMALS.items()})
     worst = views["psnr"] == views["psnr"].min()
@@ -74,7 +74,7 @@ def format_table(views: pd.DataFrame) -> str:
 
 
 def to_json(views: pd.DataFrame, source: Path, scene: dict[str, object], device: torch.device) -> dict[str, object]:
-    """The evaluation as plain values; the mean of a figure that some view lacks is None."""
+    """The evaluation as plain values; the mean of a metric missing in any view is None."""
     machine = {"device": str(device), "machine": describe_machine(device)}
     records = views.reset_index(names="view").to_dict("records")
     figures = {"mean": nan_to_none(views.mean(skipna=False).to_dict()), "views": nan_to_none(records)}

@@ -1,1 +1,1 @@
-"""Run folders as something else: a small file, ready to render."""
+"""Export of runs: compact files, meshes, points, voxels, web pages and posed photos."""

@@ -1,4 +1,4 @@
-"""A scene's field as a page can draw it: planes and lines or voxels, between the occupied cells of a grid."""
+"""Baking fields for web pages: TensoRF or voxels, with an occupancy grid."""
 
 import copy
 import math
@@ -21,46 +21,46 @@ from nerf_lightning.utils.progress import track_progress
 from nerf_lightning.utils.text import subsample
 
 GRID_RESOLUTION, STEPS_PER_RAY = 128, 192
-"""Along a side of the grid, and along a ray, that stand for another sampler."""
+"""Occupancy grid cells per axis, and steps per ray, that replace another sampler."""
 SH_DEGREE, MAX_DIRECTIONS = 1, 24
-"""Of the harmonics that stand for another field's colours, and how many cameras' directions they are fitted to."""
+"""Degree of the spherical harmonics baked from a field, and number of view directions they are fitted to."""
 RIDGE_DAMPING = 1e-2
-"""Of that fit, per direction: what a few directions do not tell stays near 0."""
+"""Ridge regularization of that fit, per direction."""
 MAX_LOGIT = 6.0
-"""Largest: beyond, a byte does not change."""
+"""Largest logit of a colour: beyond, 8-bit values do not change."""
 MAX_VERTICES = 700_000
-"""Vertices that are kept, unless the user gives their cells: some six megabytes."""
+"""Limit for kept vertices (about 6 MB), unless the user sets the resolution."""
 CUBE_MARGIN = 1e-4
-"""Distance to the unit cube's sides within which there is nothing: in an unbounded scene, they are infinitely far."""
+"""Margin at the unit cube's faces, which are infinitely far in an unbounded scene."""
 DISTILL_STEPS, DISTILL_RAYS, DISTILL_LR = 400, 4096, 0.05
-"""Steps, rays of each, and Adam's learning rate, with which voxels learn from the field they stand for."""
+"""Distillation steps, rays per step, and Adam's learning rate."""
 CHUNK_VERTICES = 1 << 14
-"""Vertices at a time."""
+"""Vertices per batch."""
 
 
 class BakedSystem(NamedTuple):
-    """A system that a page can draw."""
+    """A system that a web page can render."""
 
     system: NeRF3D
     config: dict[str, Any]
-    """Of its run, with what was put in the place of the run's own."""
+    """Configuration of the run, with its replaced parts."""
     changes: list[str]
-    """What that was, in words; where there is any, the occupied cells are those that the cameras see."""
+    """Descriptions of replaced parts; if any, the occupied cells are those visible to the cameras."""
 
 
 def is_web_renderable(system: NeRF3D) -> bool:
-    """Whether a page can draw a system without any change."""
+    """Whether a web page can render a system unchanged."""
     return isinstance(system.field, TensoRFField | VoxelField) and isinstance(system.sampler, OccupancySampler)
 
 
 def bake_system(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: int | None) -> BakedSystem:
-    """The system itself where a page can draw it; otherwise a copy with another field, another sampler, or both.
+    """Returns the system if a page can render it, else a copy with a voxel field, an occupancy sampler, or both.
 
     Args:
         system: trained.
-        cameras: views of the content: what they see is kept.
+        cameras: training views; what they see is kept.
         config: of its run, as plain values.
-        cells: along a side of voxels that stand for another field; None takes as many as photos show, but not too many.
+        cells: voxels per axis of a baked field; None takes the photos' resolution, within limits.
     """
     config = copy.deepcopy(config)
     changes: list[str] = []
@@ -68,39 +68,39 @@ def bake_system(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells:
         return BakedSystem(system, config, changes)
     field, sampler = system.field, system.sampler
     keeps_field, keeps_sampler = isinstance(field, TensoRFField | VoxelField), isinstance(sampler, OccupancySampler)
-    made = copy.copy(system)
-    made._modules = dict(system._modules)  # the copy's parts are replaced, not changed
+    baked = copy.copy(system)
+    baked._modules = dict(system._modules)  # replaces modules of the copy only
     grid = sampler.grid.resolution if isinstance(sampler, OccupancySampler) else GRID_RESOLUTION
     if keeps_field:
         seen = dilate(find_visible_cells(system, cameras, grid))
     else:
-        made.field, options = bake_voxels(system, cameras, cells)
+        baked.field, options = bake_voxels(system, cameras, cells)
         config["model"] = describe_target(VoxelField, **options)
-        changes.append(f"voxels, {made.field.side - 1} a side, in place of its own field")
-        seen = resample_occupancy(made.field, grid)
+        changes.append(f"voxels, {baked.field.side - 1} a side, in place of its own field")
+        seen = resample_occupancy(baked.field, grid)
     if not keeps_sampler:
         config["sampler"] = describe_target(OccupancySampler, samples=STEPS_PER_RAY, resolution=GRID_RESOLUTION)
         changes.append(f"{STEPS_PER_RAY} steps between {GRID_RESOLUTION} cells a side in place of its own samples")
     steps = OccupancySampler(field.bounds, STEPS_PER_RAY, GRID_RESOLUTION, chunk=system.chunk)
-    made.sampler = copy.deepcopy(sampler) if keeps_sampler else steps
-    made.sampler.import_state({"grid.occupied": seen.flatten()})
-    made.sampler.to(system.device)
+    baked.sampler = copy.deepcopy(sampler) if keeps_sampler else steps
+    baked.sampler.import_state({"grid.occupied": seen.flatten()})
+    baked.sampler.to(system.device)
     if not keeps_field:
-        distill(made, system, cameras)
-    return BakedSystem(made, config, changes)
+        distill(baked, system, cameras)
+    return BakedSystem(baked, config, changes)
 
 
 def describe_target(kind: type, **options: Any) -> dict[str, Any]:
-    """As configurations name a module."""
+    """The configuration of a module, as plain values."""
     return {"_target_": f"{kind.__module__.rsplit('.', 1)[0]}.{kind.__name__}", **options}
 
 
 @torch.no_grad()
 def bake_voxels(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[VoxelField, dict[str, Any]]:
-    """Voxels with the densities of a system's field, and its colours as some cameras see them, and their options.
+    """Bakes a field into voxels; returns them and their options.
 
     Args:
-        system, cameras, cells: as in `drawable`.
+        system, cameras, cells: as in `bake_system`.
     """
     bounds = system.field.bounds
     across = cells or min(max(math.ceil(min(bounds.unit_cube_pixels, MAX_RESOLUTION)), MIN_RESOLUTION), MAX_RESOLUTION)
@@ -126,45 +126,45 @@ def bake_voxels(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
         across = max(MIN_RESOLUTION, min(across - 1, int(across * math.sqrt(MAX_VERTICES / count))))
     chosen = keep[vertices]
     centres = cameras.centres[torch.tensor(subsample(len(cameras), MAX_DIRECTIONS))].to(system.device)
-    found = [fit_colours(system, part, centres, voxels.terms) for part in positions[chosen].split(CHUNK_VERTICES)]
-    colours, views = (torch.cat(column) for column in zip(*found, strict=True))
+    parts = [fit_colors(system, part, centres, voxels.terms) for part in positions[chosen].split(CHUNK_VERTICES)]
+    colors, views = (torch.cat(column) for column in zip(*parts, strict=True))
     raw = (density[chosen] * voxels.unit_length).log().clamp(EMPTY_LOG_DENSITY, 15.0) / voxels.density_lr_scale
-    nothing = (
+    empty_row = (
         raw.new_full((1,), EMPTY_LOG_DENSITY / voxels.density_lr_scale),
-        colours.new_zeros(1, 3),
+        colors.new_zeros(1, 3),
         views.new_zeros(1, views.shape[1]),
     )
-    voxels.set_vertices(keep.flatten(), [torch.cat(pair) for pair in zip(nothing, (raw, colours, views), strict=True)])
+    voxels.set_vertices(keep.flatten(), [torch.cat(pair) for pair in zip(empty_row, (raw, colors, views), strict=True)])
     return voxels, options
 
 
-def distill(made: NeRF3D, system: NeRF3D, cameras: Cameras) -> None:
-    """Lets a new field learn from pictures that the old one renders: what lies between vertices is otherwise lost."""
-    rays, colours = [], []
+def distill(baked: NeRF3D, system: NeRF3D, cameras: Cameras) -> None:
+    """Trains the baked field on renders of the original, to recover detail between vertices."""
+    rays, colors = [], []
     for view in track_progress(range(len(cameras)), len(cameras), "views"):
         rays.append(cameras.generate_view_rays(view))
         with torch.no_grad():
-            colours.append(system.render(rays[-1].to(system.device)).rgb.cpu())
-    origins, directions, truth = (
-        torch.cat(x) for x in ([r.origins for r in rays], [r.directions for r in rays], colours)
+            colors.append(system.render(rays[-1].to(system.device)).rgb.cpu())
+    origins, directions, targets = (
+        torch.cat(x) for x in ([r.origins for r in rays], [r.directions for r in rays], colors)
     )
     generator = torch.Generator(system.device).manual_seed(system.seed)
-    optimizer = torch.optim.Adam(made.field.parameters(), DISTILL_LR, (0.5, 0.99))
+    optimizer = torch.optim.Adam(baked.field.parameters(), DISTILL_LR, (0.5, 0.99))
     for step in track_progress(range(DISTILL_STEPS), DISTILL_STEPS, "steps"):
         optimizer.param_groups[0]["lr"] = DISTILL_LR * (1 + math.cos(math.pi * step / DISTILL_STEPS)) / 2
-        chosen = torch.randint(len(truth), (DISTILL_RAYS,), generator=generator, device=system.device).cpu()
-        some = Rays(origins[chosen], directions[chosen]).to(system.device)
+        chosen = torch.randint(len(targets), (DISTILL_RAYS,), generator=generator, device=system.device).cpu()
+        batch = Rays(origins[chosen], directions[chosen]).to(system.device)
         with torch.no_grad():
-            samples = made.sampler(some, made.field.density, None)
-        seen = made.renderer(some, samples, made.field)
-        loss = (seen.rgb - truth[chosen].to(system.device)).square().mean()
+            samples = baked.sampler(batch, baked.field.density, None)
+        rendered = baked.renderer(batch, samples, baked.field)
+        loss = (rendered.rgb - targets[chosen].to(system.device)).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
 
 
 def compute_cell_sizes(bounds: Bounds, positions: Float[Tensor, "N 3"], across: int) -> Float[Tensor, "N"]:
-    """How large a cell of a grid over the bounds is at world places: the mean over its sides, world units."""
+    """Mean side of a grid cell at world positions, world units."""
     unit = bounds.to_unit(positions.clone())
     half = 0.5 / across
     ends = [bounds.to_world((unit + side * half).clamp(CUBE_MARGIN, 1 - CUBE_MARGIN)) for side in (-1, 1)]
@@ -172,26 +172,26 @@ def compute_cell_sizes(bounds: Bounds, positions: Float[Tensor, "N 3"], across: 
 
 
 def resample_occupancy(voxels: VoxelField, grid: int) -> CellMask:
-    """The cells of another grid in which voxels hold something, and their neighbours."""
-    kept = voxels.occupied.view(*[voxels.side] * 3).nonzero()
-    x, y, z = (kept * grid // (voxels.side - 1)).clamp(0, grid - 1).unbind(1)
-    found = torch.zeros(grid, grid, grid, dtype=torch.bool, device=kept.device)
-    found[x, y, z] = True
-    return dilate(found)
+    """Marks cells of a grid of resolution `grid` that contain occupied voxels, and their neighbours."""
+    occupied = voxels.occupied.view(*[voxels.side] * 3).nonzero()
+    x, y, z = (occupied * grid // (voxels.side - 1)).clamp(0, grid - 1).unbind(1)
+    mask = torch.zeros(grid, grid, grid, dtype=torch.bool, device=occupied.device)
+    mask[x, y, z] = True
+    return dilate(mask)
 
 
-def fit_colours(
+def fit_colors(
     system: NeRF3D, positions: Float[Tensor, "N 3"], centres: Float[Tensor, "D 3"], terms: int
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N C"]]:
-    """Colours of voxels at some places, and the harmonics closest to how they change between the cameras' directions: by least
-    squares, before the sigmoid."""
+    """Fits the base colour and spherical harmonics of vertices to a field's colours, seen from camera centres:
+    ridge regression on logits."""
     directions = torch.nn.functional.normalize(positions[:, None] - centres, dim=2)
-    several = positions[:, None].expand_as(directions).flatten(0, 1)
-    rgb = system.field(several, directions.flatten(0, 1))[1].view(directions.shape)
+    repeated = positions[:, None].expand_as(directions).flatten(0, 1)
+    rgb = system.field(repeated, directions.flatten(0, 1))[1].view(directions.shape)
     logits = torch.logit(rgb, 1 / (1 + math.exp(MAX_LOGIT)))
     basis = encode_directions(directions.flatten(0, 1), 1 + terms)[:, 1:].view(*directions.shape[:2], -1)
-    mean, middle = logits.mean(1, keepdim=True), basis.mean(1, keepdim=True)
-    basis = basis - middle
+    mean, basis_mean = logits.mean(1, keepdim=True), basis.mean(1, keepdim=True)
+    basis = basis - basis_mean
     normal = basis.mT @ basis + RIDGE_DAMPING * len(centres) * torch.eye(terms, device=basis.device)
     views = torch.linalg.solve(normal, basis.mT @ (logits - mean))
-    return mean[:, 0] - (middle @ views)[:, 0], views.mT.flatten(1)
+    return mean[:, 0] - (basis_mean @ views)[:, 0], views.mT.flatten(1)

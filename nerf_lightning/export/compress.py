@@ -1,4 +1,4 @@
-"""The smallest compact file of a run that still shows what the run shows: all that its photos' cameras see."""
+"""Compression: pruning to visible cells and quantization, within an allowed PSNR drop."""
 
 import copy
 import math
@@ -23,26 +23,26 @@ from nerf_lightning.utils.progress import track_progress
 from nerf_lightning.utils.text import subsample
 
 MAX_VISIBILITY_VIEWS = 60
-"""Training views whose rays show which cells matter."""
+"""Number of training views used to determine visible cells."""
 PRECISIONS = ("byte", "half")
 """Smallest first."""
 MIN_OPACITY = 1e-3
-"""Opacity below which a step is empty."""
+"""Opacity of a sample below which it is empty."""
 MAX_RAYS_PER_PIXEL_SIDE = 8
-"""Most rays along a pixel's side."""
+"""Maximum supersampling per pixel axis."""
 
 CellMask = Bool[Tensor, "G G G"]
-"""A mask over the cells of a sampler's grid."""
+"""Mask over the cells of an occupancy grid."""
 
 
 def get_occupied_cells(system: System) -> CellMask | None:
-    """Cells in which the sampler looks for something; None for a sampler without a grid."""
+    """Occupied cells of the sampler's grid; None for a sampler without one."""
     sampler = system.exportable_modules.get("sampler")
     return sampler.grid.occupied.view(*[sampler.grid.resolution] * 3) if isinstance(sampler, OccupancySampler) else None
 
 
 def find_seen_cells(system: NeRF3D, cameras: Cameras) -> CellMask | None:
-    """The occupied cells that are visible to the cameras, and their neighbours."""
+    """Occupied cells that are visible to the cameras, and their neighbours; None without an occupancy grid."""
     occupied = get_occupied_cells(system)
     if occupied is None:
         return None
@@ -51,17 +51,14 @@ def find_seen_cells(system: NeRF3D, cameras: Cameras) -> CellMask | None:
 
 @torch.no_grad()
 def find_visible_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
-    """The cells of a grid of n^3 over the bounds in which some camera sees something.
-
-    Rays are as close to each other at the content as cells are.
-    """
+    """Cells of an n^3 grid over the bounds in which any camera sees content; ray spacing matches the cells."""
     bounds = system.field.bounds
     cell = (4 if bounds.unbounded else 2) * bounds.max_half_size / n
-    times = min(MAX_RAYS_PER_PIXEL_SIDE, math.ceil(cameras.pixel_footprint(bounds.centre.cpu()) / cell))
-    fine = cameras.rescale(times)
+    factor = min(MAX_RAYS_PER_PIXEL_SIDE, math.ceil(cameras.pixel_footprint(bounds.centre.cpu()) / cell))
+    supersampled = cameras.rescale(factor)
     seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
-    for view in track_progress(range(len(fine)), len(fine), "views"):
-        rays = fine.generate_view_rays(view)
+    for view in track_progress(range(len(supersampled)), len(supersampled), "views"):
+        rays = supersampled.generate_view_rays(view)
         for start in range(0, len(rays), system.chunk_rays):
             chunk = rays[start : start + system.chunk_rays].to(system.device)
             samples = system.sampler(chunk, system.field.density)
@@ -73,42 +70,41 @@ def find_visible_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
 
 
 def prune_to_cells(system: System, cells: CellMask | None) -> System:
-    """A copy of a system with only what some cells need, on the CPU, to be encoded; the system itself for None."""
+    """A CPU copy of a system with only the parameters that `cells` need; the system itself for None."""
     if cells is None:
         return system
-    part: Any = copy.deepcopy(system).cpu()
-    part.field.prune(cells.cpu())
-    part.sampler.import_state({"grid.occupied": cells.cpu().flatten()})
-    return part
+    pruned: Any = copy.deepcopy(system).cpu()
+    pruned.field.prune(cells.cpu())
+    pruned.sampler.import_state({"grid.occupied": cells.cpu().flatten()})
+    return pruned
 
 
 @dataclass(frozen=True)
 class CompactFile:
-    """A compact file, and its quality."""
+    """Content and quality of a compact file."""
 
     content: bytes
     precision: str
     psnr: float
-    """dB on the held-out views."""
+    """Held-out PSNR, dB."""
     psnr_before: float
-    """The same of the system it was made from."""
+    """Held-out PSNR of the original system, dB."""
 
     @property
     def psnr_drop(self) -> float:
-        """dB lost."""
         return self.psnr_before - self.psnr
 
 
 def measure_held_out_psnr(system: System, data: DataModule, views: Sequence[int] | None = None) -> float:
-    """Mean dB over held-out views that have a figure, nan where none has; over all of them for None."""
+    """Mean PSNR over held-out views with known pixels, dB (all views for None); NaN if there is none."""
     chosen = range(data.num_held_out_views) if views is None else views
     results = system.evaluate_held_out(data, track_progress(chosen, len(chosen), "held-out views"))
-    finite = [result.psnr for result in results if math.isfinite(result.psnr)]  # of some, no pixel may be known
+    finite = [result.psnr for result in results if math.isfinite(result.psnr)]  # fully masked views have none
     return fmean(finite) if finite else math.nan
 
 
 def subsample_cameras(data: DataModule, max_views: int = MAX_VISIBILITY_VIEWS) -> Cameras:
-    """Those of training views spread over all."""
+    """Cameras of evenly spaced training views."""
     cameras = data.scene.train.cameras
     return cameras[torch.tensor(subsample(len(cameras), max_views))]
 
@@ -120,34 +116,34 @@ def compress_system(
     max_psnr_drop: float,
     seen: CellMask | None = None,
 ) -> CompactFile:
-    """Encodes a system in the fewest bytes within the allowed loss: what its photos' cameras see, or everything.
+    """Encodes a system in the fewest bytes within `max_psnr_drop`: first only visible cells, then all.
 
     Args:
         system: trained.
         data: of its run.
         config: of its run, as plain values.
-        most_loss: dB on held-out views.
-        seen: the occupied cells that its photos' cameras see, where they are known.
+        max_psnr_drop: on held-out views, dB.
+        seen: occupied cells visible to the training cameras, if known.
 
     Raises:
-        InputError: where every precision loses more.
+        InputError: every precision loses more.
     """
     before = measure_held_out_psnr(system, data)
     if seen is None and data.is_posed:
         seen = find_seen_cells(system, subsample_cameras(data))
     occupied = get_occupied_cells(system)
-    alike = seen is None or occupied is None or torch.equal(seen, occupied)
-    confined = [prune_to_cells(system, cells) for cells in ([seen] if alike else [seen, occupied])]
+    same_cells = seen is None or occupied is None or torch.equal(seen, occupied)
+    candidates = [prune_to_cells(system, cells) for cells in ([seen] if same_cells else [seen, occupied])]
     scene = scene_to_dict(data)
-    tried: list[CompactFile] = []
-    for one in PRECISIONS:
-        for part in confined:  # few photos do not see all that held-out views do
-            content = encode(part, one, config, scene)
+    attempts: list[CompactFile] = []
+    for precision in PRECISIONS:
+        for part in candidates:  # held-out views may see more than few photos do
+            content = encode(part, precision, config, scene)
             small = decode(content, "compact", system.device).system
-            tried.append(CompactFile(content, one, measure_held_out_psnr(small, data), before))
-            if tried[-1].psnr_drop <= max_psnr_drop:
-                return tried[-1]
-    best = min(tried, key=lambda compact: compact.psnr_drop)
+            attempts.append(CompactFile(content, precision, measure_held_out_psnr(small, data), before))
+            if attempts[-1].psnr_drop <= max_psnr_drop:
+                return attempts[-1]
+    best = min(attempts, key=lambda compact: compact.psnr_drop)
     advice = f"allow it with --max-psnr-drop {best.psnr_drop + 0.005:.2f}"
     raise InputError(
         "export", "max_psnr_drop", f"{best.psnr_drop:.2f} dB lost", f"at most {max_psnr_drop:g} dB", advice

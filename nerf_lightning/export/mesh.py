@@ -1,4 +1,4 @@
-"""Meshes, point clouds and voxel grids for other programs, in the place and at the scale of the photos' own file."""
+"""Mesh, point cloud and voxel grid files, in the frame and unit of the photos' own file."""
 
 import io
 import math
@@ -25,26 +25,26 @@ if TYPE_CHECKING:
     import trimesh
 
 SUFFIXES = {"mesh": (".ply", ".glb", ".obj", ".stl"), "points": (".ply",), "voxels": (".npz",)}
-"""Of files, by what they hold; the default first."""
+"""File suffixes by content, default first."""
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""From z up, as scenes have it, to y up, as glTF wants it: written as the node's transform."""
+"""Rotation from z up (scenes) to y up (glTF), stored as the node's transform."""
 FLOAT32_ROUNDOFF = 2.0**-24
-"""Largest relative error of a number rounded to single precision."""
+"""Relative rounding error of float32."""
 MAX_RELATIVE_ERROR = 1e-4
-"""Largest rounding error of a vertex, as a share of a mesh's longest side: a fortieth of the finest cell's."""
-OBJ_DIGITS, OBJ_COLOUR_DECIMALS = 9, 4
-"""Significant digits of an OBJ file's coordinates, relative to the mesh's longest side, and decimals of colours."""
+"""Largest rounding error of a vertex, relative to the mesh's longest side: a fortieth of the finest cell."""
+OBJ_DIGITS, OBJ_COLOR_DECIMALS = 9, 4
+"""Significant digits of OBJ coordinates, relative to the mesh's longest side, and decimals of colours."""
 
 
 class ExportedFile(NamedTuple):
-    """A file's content, and what it holds in words."""
+    """Content and description of a file."""
 
     content: bytes
     description: str
 
 
 def select_training_views(run: LoadedSceneRun, photos: Path | None = None) -> Cameras:
-    """Some of the views that a field was trained from; without photos, a spiral that begins on its orbit."""
+    """Evenly spaced training cameras; a spiral from the orbit if photos are missing."""
     try:
         data = reload_data(run.cfg, run.scene, photos)
     except InputError as error:
@@ -56,14 +56,14 @@ def select_training_views(run: LoadedSceneRun, photos: Path | None = None) -> Ca
 
 
 @torch.no_grad()
-def query_colours(
+def query_colors(
     system: NeRF3D, positions: Float[Tensor, "N 3"], outwards: Float[Tensor, "N 3"]
 ) -> UInt8[ndarray, "N 3"]:
-    """The colours of a field at some places, seen against their outward directions, world frame."""
-    together = POSITIONS_PER_SAMPLE * system.chunk
+    """Colours of a field at world positions, seen from outside along `outwards`."""
+    batch_size = POSITIONS_PER_SAMPLE * system.chunk
     parts = [
-        system.field(some.to(system.device), -away.to(system.device))[1].cpu()
-        for some, away in zip(positions.split(together), outwards.split(together), strict=True)
+        system.field(points.to(system.device), -normals.to(system.device))[1].cpu()
+        for points, normals in zip(positions.split(batch_size), outwards.split(batch_size), strict=True)
     ]
     return to_uint8(torch.cat([torch.zeros(0, 3), *parts]))
 
@@ -71,14 +71,14 @@ def query_colours(
 def extract_mesh(
     run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None
 ) -> tuple["trimesh.Trimesh", Surface]:
-    """The surface of a field's solid, as some cameras see it, with a colour at each vertex, in the photos' frame."""
+    """Extracts the surface visible to cameras, with vertex colours, in the dataset's frame."""
     import trimesh
 
     surface = extract_surface(volume, find_unoccluded_cells(run.system, volume, cameras), threshold)
     normals = torch.from_numpy(surface.normals)
     positions = torch.from_numpy(surface.vertices)
-    # Half a cell inside: just outside the surface no photo constrains the colour.
-    rgb = query_colours(run.system, positions - normals * (volume.cell / 2), normals)
+    # Half a cell inside: photos do not constrain the colour outside the surface.
+    rgb = query_colors(run.system, positions - normals * (volume.cell / 2), normals)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=rgb, process=False)
     mesh.apply_transform(run.to_source.numpy())
     return mesh, surface
@@ -87,7 +87,7 @@ def extract_mesh(
 def build_mesh_file(
     run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str
 ) -> ExportedFile:
-    """A coloured mesh as .ply, .obj or .glb; its triangles alone as .stl."""
+    """Builds a coloured mesh as .ply, .obj or .glb, or triangles only as .stl."""
     mesh, surface = extract_mesh(run, cameras, volume, threshold)
     content = encode_mesh(mesh, suffix, run.to_source[:3, :3].T.numpy() / run.scale)
     description = [
@@ -101,18 +101,18 @@ def build_mesh_file(
 
 
 def build_points_file(run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None) -> ExportedFile:
-    """The mesh's vertices alone, with their colours, as .ply."""
+    """Builds a .ply file of the mesh's vertices and colours."""
     mesh, surface = extract_mesh(run, cameras, volume, threshold)
-    colours: Any = mesh.visual
-    content = encode_ply(mesh.vertices, colours.vertex_colors[:, :3])
+    colors: Any = mesh.visual
+    content = encode_ply(mesh.vertices, colors.vertex_colors[:, :3])
     return ExportedFile(content, f"{len(mesh.vertices):,} points, surface at opacity {surface.threshold:.2f}")
 
 
 def build_voxels_file(run: LoadedSceneRun, volume: Volume) -> ExportedFile:
-    """Densities and colours of all cells as .npz.
+    """Builds an .npz file of density and colour.
 
-    `density` [X, Y, Z] is per unit of the photos' file, `rgb` [X, Y, Z, 3] what is seen looking along the density's
-    gradient, `to_source` [4, 4] maps indices (whole numbers are centres of cells) to the frame of the photos' file.
+    `density` [X, Y, Z] is per unit of the dataset's frame, `rgb` [X, Y, Z, 3] the colour seen along the density gradient,
+    `to_source` [4, 4] maps indices (integers are cell centres) to the dataset's frame.
     """
     solid = volume.density > 0
     index = solid.nonzero()
@@ -120,9 +120,9 @@ def build_voxels_file(run: LoadedSceneRun, volume: Volume) -> ExportedFile:
         torch.gradient(volume.opacity) if min(solid.shape) > 1 else [torch.zeros(solid.shape)] * 3, -1
     )
     outwards = -torch.nn.functional.normalize(gradient[solid], dim=-1)
-    outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # where density is even, any direction will do
+    outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # arbitrary where density is constant
     rgb = np.zeros((*solid.shape, 3), np.uint8)
-    rgb[solid.numpy()] = query_colours(run.system, volume.index_to_world(index.float()), outwards)
+    rgb[solid.numpy()] = query_colors(run.system, volume.index_to_world(index.float()), outwards)
     file = io.BytesIO()
     arrays: dict[str, Any] = {
         "density": (volume.density / run.scale).numpy().astype(np.float32),
@@ -135,18 +135,18 @@ def build_voxels_file(run: LoadedSceneRun, volume: Volume) -> ExportedFile:
 
 
 def encode_ply(vertices: Float[ndarray, "V 3"], rgb: UInt8[ndarray, "V 3"], faces: ndarray | None = None) -> bytes:
-    """A binary PLY file with vertices in double precision (Turk 1994); trimesh writes single.
+    """Encodes a binary PLY file (Turk 1994) with float64 vertices; trimesh writes float32.
 
     Args:
         vertices: in the file's frame.
-        rgb: of the vertices.
-        faces: [F, 3] indices of vertices; None for points alone.
+        rgb: vertex colours.
+        faces: [F, 3] vertex indices; None for a point cloud.
     """
-    colours = ("red", "green", "blue")
-    kinds = [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in colours]
+    channels = ("red", "green", "blue")
+    kinds = [(name, "<f8") for name in "xyz"] + [(name, "u1") for name in channels]
     body = np.rec.fromarrays([*vertices.T, *rgb.T], dtype=kinds).tobytes()
     lines = ["ply", "format binary_little_endian 1.0", "comment nerf_lightning", f"element vertex {len(vertices)}"]
-    lines += [*(f"property double {name}" for name in "xyz"), *(f"property uchar {name}" for name in colours)]
+    lines += [*(f"property double {name}" for name in "xyz"), *(f"property uchar {name}" for name in channels)]
     if faces is not None:
         kinds = [("count", "u1"), ("a", "<i4"), ("b", "<i4"), ("c", "<i4")]
         body += np.rec.fromarrays([np.full(len(faces), 3), *faces.T], dtype=kinds).tobytes()
@@ -154,40 +154,40 @@ def encode_ply(vertices: Float[ndarray, "V 3"], rgb: UInt8[ndarray, "V 3"], face
     return "\n".join([*lines, "end_header", ""]).encode() + body
 
 
-def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, turn: Float[ndarray, "3 3"]) -> bytes:
-    """A coloured mesh as .ply, .obj, .stl or .glb.
+def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, rotation: Float[ndarray, "3 3"]) -> bytes:
+    """Encodes a coloured mesh as .ply, .obj, .stl or .glb.
 
-    GLB has single precision: its coordinates are those about the mesh's middle, to which its node moves them.
+    GLB stores float32: vertices are relative to the mesh's centre, and the node's transform restores it.
 
     Args:
-        mesh: with a colour at each vertex.
+        mesh: with vertex colours.
         suffix: of the file.
-        turn: the rotation of a GLB file's node to z up, about the middle.
+        rotation: to z up of a GLB file's node.
 
     Raises:
-        InputError: for STL, which has single precision, where that does not suffice.
+        InputError: float32 of an .stl file is too coarse for the coordinates.
     """
-    colours: Any = mesh.visual
+    colors: Any = mesh.visual
     content: Any
     if suffix == ".ply":
-        return encode_ply(mesh.vertices, colours.vertex_colors[:, :3], mesh.faces)
+        return encode_ply(mesh.vertices, colors.vertex_colors[:, :3], mesh.faces)
     if suffix == ".obj":
-        digits = max(OBJ_COLOUR_DECIMALS, OBJ_DIGITS - math.floor(math.log10(float(mesh.extents.max()))))
+        digits = max(OBJ_COLOR_DECIMALS, OBJ_DIGITS - math.floor(math.log10(float(mesh.extents.max()))))
         content = mesh.export(file_type="obj", digits=digits, header="nerf_lightning", include_normals=False)
         return content.encode()
     if suffix == ".stl":
         farthest = float(np.abs(mesh.vertices).max())
         if farthest * FLOAT32_ROUNDOFF > MAX_RELATIVE_ERROR * mesh.extents.max():
-            found = f".stl for coordinates up to {farthest:.6g}, too large for its single precision"
-            raise InputError("export", "output", found, ".obj, .ply or .glb")
+            problem = f".stl for coordinates up to {farthest:.6g}, too large for its single precision"
+            raise InputError("export", "output", problem, ".obj, .ply or .glb")
         content = mesh.export(file_type="stl")
         return content
     import trimesh
 
-    middle, moved = mesh.vertices.mean(0), mesh.copy()
-    moved.vertices = mesh.vertices - middle
+    centre, centred = mesh.vertices.mean(0), mesh.copy()
+    centred.vertices = mesh.vertices - centre
     scene, node = trimesh.Scene(), np.eye(4)
-    node[:3, :3], node[:3, 3] = Y_UP @ turn, Y_UP @ middle
-    scene.add_geometry(moved, transform=node)
+    node[:3, :3], node[:3, 3] = Y_UP @ rotation, Y_UP @ centre
+    scene.add_geometry(centred, transform=node)
     content = scene.export(file_type="glb")
     return content

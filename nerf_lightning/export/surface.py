@@ -1,4 +1,4 @@
-"""From densities to a surface, without floating pieces and without what is hidden inside a solid."""
+"""Surface extraction from densities: no floaters, and no cavities inside solids."""
 
 from dataclasses import dataclass
 
@@ -16,35 +16,34 @@ from nerf_lightning.utils.progress import track_progress
 
 HISTOGRAM_BINS = 128
 MIN_CELL_OPACITY = 0.02
-"""Opacity of a cell below which it is empty, and left out when the threshold is chosen."""
+"""Opacity below which a cell is empty, and ignored by Otsu's method."""
 MISS_DISTANCE = 1e9
-"""Where a ray ends that meets nothing."""
+"""Depth of a ray without a hit."""
 MAX_VISIBILITY_SIDE = 300
-"""Most pixels along a view's longer side when visibility is rendered."""
+"""Longest side of the views rendered for visibility, pixels."""
 MAX_FLOATER_FRACTION = 0.01
-"""A piece with fewer cells than this share of the largest is left out."""
+"""Size of a connected component, relative to the largest, below which it is removed."""
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Triangles around the solid, in the world frame."""
+    """A triangle mesh in the world frame."""
 
     vertices: Float[ndarray, "V 3"]
     faces: ndarray
-    """[F, 3] indices of vertices, counterclockwise seen from outside."""
+    """[F, 3] vertex indices, counterclockwise from outside."""
     normals: Float[ndarray, "V 3"]
-    """Unit length, outwards."""
+    """Unit outward normals."""
     threshold: float
     """Opacity of a cell at the surface."""
     floaters: int
-    """Pieces left out."""
+    """Number of components removed."""
 
 
 def compute_otsu_threshold(values: Float[ndarray, "N"]) -> float:
-    """The value from which on something is solid: the upper threshold that parts values into three groups, haze, blurred
-    sides and solids, of the least variance within (Otsu 1979, section IV); 0.5 for no values at all.
+    """Otsu's upper threshold for three classes: haze, blurred boundaries and solids (Otsu 1979, section IV); 0.5 if empty.
 
-    Two groups would do for a clean field. With much haze, the threshold between two groups lies within the haze.
+    With two classes and much haze, the threshold would lie within the haze.
     """
     from skimage.filters import threshold_multiotsu
 
@@ -53,78 +52,77 @@ def compute_otsu_threshold(values: Float[ndarray, "N"]) -> float:
     low, high = float(values.min()), float(values.max())
     if len(np.flatnonzero(np.histogram(values, HISTOGRAM_BINS)[0])) < 3:
         return (low + high) / 2 if low < high else high / 2
-    # It names the middle of a bin, all of which belongs below.
-    found = threshold_multiotsu(values, 3, HISTOGRAM_BINS)[1] + (high - low) / HISTOGRAM_BINS / 2
-    # Between two clear groups many thresholds are as good: the middle one.
-    above = values > found
+    # scikit-image returns the centre of a bin that belongs below the threshold.
+    threshold = threshold_multiotsu(values, 3, HISTOGRAM_BINS)[1] + (high - low) / HISTOGRAM_BINS / 2
+    # Between two separate classes, take the middle of the gap.
+    above = values > threshold
     return float(values[~above].max() + values[above].min()) / 2
 
 
 @torch.no_grad()
 def find_unoccluded_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> Bool[ndarray, "X Y Z"]:
-    """Cells that at least one view sees, up to the surface it renders there; all others are inside something.
+    """Cells in front of the rendered surface in at least one view; all others are inside solids.
 
     Args:
-        system: the field that the volume was sampled from.
-        volume: whose cells are tested.
-        cameras: the views it was trained from.
+        system: the volume's source.
+        volume: grid of cells.
+        cameras: training views.
     """
-    places = volume.centres.view(-1, 3)
-    dark = torch.arange(len(places))
+    centres = volume.centres.view(-1, 3)
+    occluded = torch.arange(len(centres))
     cameras = cameras.rescale(min(1.0, MAX_VISIBILITY_SIDE / cameras.max_side))
-    # Within a pixel a slanted surface has many depths: where cells are finer, the pixel's width says how far to go on.
-    beyond = max(volume.cell, CELL_WIDTH_PIXELS * cameras.pixel_footprint(system.field.bounds.centre.cpu()))
+    # A slanted surface has many depths within a pixel: the tolerance is at least the pixel's width.
+    tolerance = max(volume.cell, CELL_WIDTH_PIXELS * cameras.pixel_footprint(system.field.bounds.centre.cpu()))
     for view in track_progress(range(len(cameras)), len(cameras), "views"):
         rendered = system.render(cameras.generate_view_rays(view).to(system.device))
-        ends = torch.where(rendered.opacity > 0.5, rendered.depth, MISS_DISTANCE).cpu() + beyond
-        # At an outline a pixel's depth is a mean of near and far: the nearest of its neighbours' counts.
+        depths = torch.where(rendered.opacity > 0.5, rendered.depth, MISS_DISTANCE).cpu() + tolerance
+        # At silhouettes, depth averages near and far: dilate by the 3 x 3 neighbourhood.
         width, height = cameras.size(view)
-        ends = -torch.nn.functional.max_pool2d(-ends.view(1, height, width), 3, 1, 1).flatten()
-        pixels, _, seen = cameras.project(places[dark], view)
+        depths = -torch.nn.functional.max_pool2d(-depths.view(1, height, width), 3, 1, 1).flatten()
+        pixels, _, seen = cameras.project(centres[occluded], view)
         col, row = torch.where(seen[:, None], pixels, 0.0).long().unbind(1)
-        reach = torch.where(seen, ends[row * width + col], 0.0)
-        dark = dark[(places[dark] - cameras.centres[view]).norm(dim=1) > reach]
-    unoccluded = torch.ones(len(places), dtype=torch.bool)
-    unoccluded[dark] = False
+        max_distance = torch.where(seen, depths[row * width + col], 0.0)
+        occluded = occluded[(centres[occluded] - cameras.centres[view]).norm(dim=1) > max_distance]
+    unoccluded = torch.ones(len(centres), dtype=torch.bool)
+    unoccluded[occluded] = False
     return unoccluded.view(volume.density.shape).numpy()
 
 
 def fill_bounding_box(mask: Bool[ndarray, "X Y Z"]) -> Bool[ndarray, "X Y Z"]:
-    """The cells of the smallest box that holds all marked ones: what is unlit beyond it, such as below a floor, is not inside
-    anything."""
+    """Mask of the bounding box of a mask: occluded cells outside it, such as below a floor, are not inside a solid."""
     box = np.zeros(mask.shape, bool)
-    for place in ndimage.find_objects(mask.astype(int)):
-        box[place] = True
+    for region in ndimage.find_objects(mask.astype(int)):
+        box[region] = True
     return box
 
 
 def extract_surface(volume: Volume, unoccluded: Bool[ndarray, "X Y Z"], threshold: float | None = None) -> Surface:
-    """The surface of what is dense or in the dark, by marching cubes (Lewiner et al. 2003).
+    """Extracts the surface of dense or occluded cells by marching cubes (Lewiner et al. 2003).
 
     Args:
         volume: densities.
-        unoccluded: see `find_unoccluded_cells`; cells that are not lit count as solid.
-        threshold: opacity of a cell at the surface, in (0, 1); None finds it from the histogram of cells in the light.
+        unoccluded: see `find_unoccluded_cells`; occluded cells count as solid.
+        threshold: opacity of a cell at the surface, in (0, 1); None: Otsu's method on unoccluded cells.
 
     Raises:
-        InputError: where nothing is as dense as that.
+        InputError: no cell is above the threshold.
     """
     from skimage.measure import marching_cubes
 
     level = volume.opacity.numpy()
     if threshold is None:
         threshold = compute_otsu_threshold(level[unoccluded & (level > MIN_CELL_OPACITY)])
-    most = level.max()
+    max_opacity = level.max()
     level = np.where(unoccluded | ~fill_bounding_box(unoccluded & (level > threshold)), level, 1.0)
-    pieces, _ = ndimage.label(level > threshold, structure=np.ones((3, 3, 3)))
-    if not most > threshold:
-        found, expected = f"nothing above an opacity of {threshold:.2f} a cell", f"at most {most:.2f}"
-        raise InputError("export", "threshold", found, expected, "train longer, or lower --threshold")
-    sizes = np.bincount(pieces.ravel())[1:]
+    components, _ = ndimage.label(level > threshold, structure=np.ones((3, 3, 3)))
+    if not max_opacity > threshold:
+        problem, expected = f"nothing above an opacity of {threshold:.2f} a cell", f"at most {max_opacity:.2f}"
+        raise InputError("export", "threshold", problem, expected, "train longer, or lower --threshold")
+    sizes = np.bincount(components.ravel())[1:]
     floating = np.flatnonzero(sizes < MAX_FLOATER_FRACTION * sizes.max()) + 1
-    # A margin closes the box's sides; pieces that float go, with the haze around them.
-    gone = np.isin(pieces, floating)
-    level[ndimage.binary_dilation(gone, np.ones((3, 3, 3))) & (gone | (pieces == 0))] = 0
+    # Remove floaters with the haze around them; pad to close the surface at the box.
+    removed = np.isin(components, floating)
+    level[ndimage.binary_dilation(removed, np.ones((3, 3, 3))) & (removed | (components == 0))] = 0
     vertices, faces, normals, _ = marching_cubes(np.pad(level, 1), threshold)
-    places = volume.index_to_world(torch.from_numpy(vertices - 1).float()).numpy()
-    return Surface(places, faces[:, ::-1].copy(), normals.astype(np.float32), float(threshold), len(floating))
+    positions = volume.index_to_world(torch.from_numpy(vertices - 1).float()).numpy()
+    return Surface(positions, faces[:, ::-1].copy(), normals.astype(np.float32), float(threshold), len(floating))

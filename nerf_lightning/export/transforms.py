@@ -1,4 +1,4 @@
-"""Photos and their cameras as a folder that nerfstudio and this package read: transforms.json beside the pictures."""
+"""Export of posed photos as a nerfstudio dataset: transforms.json, images and masks."""
 
 from pathlib import Path
 from typing import Any
@@ -17,16 +17,16 @@ LENS_COEFFICIENTS = {
     Projection.PERSPECTIVE: ("k1", "k2", "k3", "p1", "p2"),
     Projection.FISHEYE: ("k1", "k2", "k3", "k4"),
 }
-"""Coefficients of a lens that the format knows."""
+"""Distortion coefficients supported by the format."""
 
 
 def write_photos(scene: Scene, folder: Path) -> None:
     """Writes the photos of a scene as PNGs below `images/`, masks below `masks/`, and `transforms.json`.
 
-    Poses are in the frame and unit of the photos' own file, as OpenGL cameras; held-out photos are named as such.
+    Poses are OpenGL cameras in the dataset's frame and unit; the split is stored.
 
     Raises:
-        InputError: for a lens that the format does not know.
+        InputError: the format does not support a lens.
     """
     parts = {"train_filenames": scene.train, "val_filenames": scene.val}
     if scene.test is not None:
@@ -52,25 +52,25 @@ def write_photos(scene: Scene, folder: Path) -> None:
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """As a PNG, in a folder that is made if need be."""
+    """Writes an image; creates its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     imageio.imwrite(path, picture)
 
 
 def describe_intrinsics(views: Views, view: int) -> dict[str, Any]:
-    """Intrinsics of a photo and its lens, by the format's names."""
+    """Intrinsics and distortion of a view, by the format's keys."""
     K, (width, height) = views.cameras.K[view].tolist(), views.cameras.size(view)
-    found = {"w": width, "h": height, "fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
+    intrinsics = {"w": width, "h": height, "fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2], "cy": K[1][2]}
     lenses = views.cameras.lenses
     if lenses is None:
-        return {"camera_model": "PINHOLE", **found}
+        return {"camera_model": "PINHOLE", **intrinsics}
     projection = Projection(int(lenses.projection[view]))
     if projection == Projection.EQUIRECTANGULAR:
-        # nerfstudio's readers want the height for both focal lengths; here the size says it all.
-        return {"camera_model": "EQUIRECTANGULAR", **found, "fl_x": height, "fl_y": height}
+        # nerfstudio expects the height as both focal lengths.
+        return {"camera_model": "EQUIRECTANGULAR", **intrinsics, "fl_x": height, "fl_y": height}
     lens = Distortion(*lenses.coefficients[view].tolist())._asdict()
     if unknown := [name for name, value in lens.items() if value and name not in LENS_COEFFICIENTS[projection]]:
         expected = f"at most {', '.join(LENS_COEFFICIENTS[projection])}, as transforms.json knows"
         raise InputError(views.name(view), unknown[0], f"{lens[unknown[0]]:g}", expected)
     model = "OPENCV_FISHEYE" if projection == Projection.FISHEYE else "OPENCV"
-    return {"camera_model": model, **found, **{name: lens[name] for name in LENS_COEFFICIENTS[projection]}}
+    return {"camera_model": model, **intrinsics, **{name: lens[name] for name in LENS_COEFFICIENTS[projection]}}

@@ -1,4 +1,4 @@
-"""A field as a grid of numbers: density and colour at the centres of cubic cells."""
+"""Sampling a field's density on a regular grid of cubic cells."""
 
 import math
 from dataclasses import dataclass, replace
@@ -15,19 +15,18 @@ from nerf_lightning.utils.memory import check_memory
 from nerf_lightning.utils.progress import track_progress
 
 MIN_RESOLUTION, MAX_RESOLUTION = 64, 256
-"""Limits for the cells along the longest side, if the user gives no number."""
+"""Limits of the default number of cells along the longest side."""
 CELL_WIDTH_PIXELS = 1.25
-"""Width of a cell in pixels: cells of one pixel add only noise to the surface."""
+"""Cell side in pixels: smaller cells add only noise to the surface."""
 POSITIONS_PER_SAMPLE = 4
-"""Places evaluated in one call, for each sample rendered in one: bounds the memory."""
-
+"""Positions per field query, relative to the system's sample chunk: bounds the memory."""
 BYTES_PER_CELL = 32
-"""Bytes of a cell: its density, its opacity, its index and its centre."""
+"""Memory per cell: density, opacity, index and centre."""
 
 
 @dataclass(frozen=True)
 class Volume:
-    """Densities in cubic cells. Cell (i, j, k) has its centre at low + (i + 0.5, j + 0.5, k + 0.5) * cell, world frame."""
+    """A grid of densities. Cell (i, j, k) is centred at low + (i + 0.5, j + 0.5, k + 0.5) * cell, world frame."""
 
     density: Float[Tensor, "X Y Z"]
     """1 / world unit."""
@@ -37,16 +36,16 @@ class Volume:
 
     @property
     def opacity(self) -> Float[Tensor, "X Y Z"]:
-        """Of one cell, crossed straight: 1 - exp(-density * cell)."""
+        """Opacity of each cell: 1 - exp(-density * cell)."""
         return 1 - torch.exp(-self.density * self.cell)
 
     def index_to_world(self, index: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Where in the world an index is; whole numbers are centres of cells."""
+        """World positions of indices; integers are cell centres."""
         return self.low + (index + 0.5) * self.cell
 
     @property
     def to_world(self) -> Float[Tensor, "4 4"]:
-        """Maps indices to the world frame, in double precision; whole numbers are centres of cells."""
+        """Index-to-world matrix, float64; integers are cell centres."""
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3, :3] *= self.cell
         matrix[:3, 3] = self.low.double() + self.cell / 2
@@ -54,27 +53,29 @@ class Volume:
 
     @property
     def centres(self) -> Float[Tensor, "X Y Z 3"]:
-        """Where in the world the centres of all cells are."""
+        """World positions of all cell centres."""
         axes = [torch.arange(count).float() for count in self.density.shape]
         return self.index_to_world(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1))
 
 
 def find_region(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tensor, "4 4"]) -> Float[Tensor, "2 3"]:
-    """Lower and upper corner of the part of some bounds, world frame, that holds a box of another frame.
+    """World-frame bounding box of a box in the dataset's frame, clipped to the bounds.
 
     Args:
-        box: lower and upper corner in the frame of the photos' own file.
-        to_source: similarity from the world frame to that one.
+        box: lower and upper corner in the dataset's frame.
+        to_source: similarity from the world frame to the dataset's.
 
     Raises:
-        InputError: where the box lies outside the bounds.
+        InputError: the box is outside the bounds.
     """
     corners = transform_points(torch.linalg.inv(to_source), torch.cartesian_prod(*box.double().T)).float()
     aabb = bounds.aabb.cpu()
     region = torch.stack([torch.maximum(corners.amin(0), aabb[0]), torch.minimum(corners.amax(0), aabb[1])])
     if not (region[0] < region[1]).all():
-        where = transform_points(to_source, torch.cartesian_prod(*aabb.double().T))
-        low, high = ([round(x, 4) for x in corner.tolist()] for corner in (where.amin(0), where.amax(0)))
+        source_corners = transform_points(to_source, torch.cartesian_prod(*aabb.double().T))
+        low, high = (
+            [round(x, 4) for x in corner.tolist()] for corner in (source_corners.amin(0), source_corners.amax(0))
+        )
         raise InputError(
             "export", "box", str(box.flatten().tolist()), f"something within {low} to {high}, the scene's box"
         )
@@ -85,15 +86,15 @@ def find_region(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tens
 def sample_volume(
     run: LoadedSceneRun, resolution: int | None = None, box: Float[Tensor, "2 3"] | None = None
 ) -> Volume:
-    """Samples a field's density in the cells that its sampler marks as occupied; it is zero elsewhere.
+    """Samples a field's density in occupied cells; zero elsewhere.
 
     Args:
         run: of a scene.
-        resolution: cells along the longest side; None takes somewhat larger ones than a pixel of the photos, within limits.
-        box: lower and upper corner of the part to sample, in the frame of the photos' own file; None takes all.
+        resolution: cells along the longest side; None: cells of `CELL_WIDTH_PIXELS`, within limits.
+        box: lower and upper corner of a crop, in the dataset's frame.
 
     Raises:
-        InputError: where the box lies outside the scene's.
+        InputError: the box is outside the scene's.
     """
     system, bounds = run.system, run.system.field.bounds
     region = bounds.aabb.cpu() if box is None else find_region(bounds, box, run.to_source)
@@ -107,23 +108,23 @@ def sample_volume(
     shape = [max(1, math.ceil(float(side) / cell - 1e-6)) for side in sides]
     count = math.prod(shape)
     check_memory("export", "resolution", f"{count:,} cells", BYTES_PER_CELL * count)
-    # Cubic cells may reach beyond the region: equally on both sides.
+    # Cubic cells may exceed the region, equally on both sides.
     volume = Volume(torch.zeros(shape), region.mean(0) - torch.tensor(shape) * (cell / 2), cell)
     occupied = get_occupied_cells(system)
-    together = POSITIONS_PER_SAMPLE * system.chunk
+    batch_size = POSITIONS_PER_SAMPLE * system.chunk
     density = []
-    for part in track_progress(volume.centres.view(-1, 3).split(together), math.ceil(count / together), "cells"):
-        places = part.to(system.device)
-        unit = bounds.to_unit(places)
-        asked = ((unit >= 0) & (unit <= 1)).all(1)
-        if box is not None:  # the region may be larger, as its axes are others
+    for part in track_progress(volume.centres.view(-1, 3).split(batch_size), math.ceil(count / batch_size), "cells"):
+        positions = part.to(system.device)
+        unit = bounds.to_unit(positions)
+        mask = ((unit >= 0) & (unit <= 1)).all(1)
+        if box is not None:  # the region is its bounding box in a rotated frame
             in_file = transform_points(run.to_source, part.double())
-            asked &= ((in_file >= box[0]) & (in_file <= box[1])).all(1).to(system.device)
+            mask &= ((in_file >= box[0]) & (in_file <= box[1])).all(1).to(system.device)
         if occupied is not None:
             n = len(occupied)
             x, y, z = (unit * n).long().clamp(0, n - 1).unbind(1)
-            asked &= occupied[x, y, z]
-        found = torch.zeros(len(places), device=system.device)
-        found[asked] = system.field.density(places[asked])
-        density.append(found.cpu())
+            mask &= occupied[x, y, z]
+        values = torch.zeros(len(positions), device=system.device)
+        values[mask] = system.field.density(positions[mask])
+        density.append(values.cpu())
     return replace(volume, density=torch.cat(density).view(shape).nan_to_num(0.0).clamp_min(0.0))

@@ -1,4 +1,4 @@
-"""A field as one web page: its compact file, a ray marcher for the browser's graphics, and what a person's hands do with it."""
+"""Self-contained web page of a field: compact file, WebGL ray marcher and controls."""
 
 import base64
 import re
@@ -25,46 +25,46 @@ STYLESHEET = WEB / "view.css"
 SCRIPTS = [WEB / f"{name}.js" for name in ("common", "compact", "textures", "camera", "renderer", "page")]
 IMAGE_SCRIPTS = [WEB / "common.js", WEB / "picture.js"]
 MAX_RAY_DISTANCE = 1e9
-"""Where a ray ends that nothing else ends, world units."""
+"""Far distance of unlimited rays, world units."""
 MIN_WEIGHT = 1e-4
-"""Share of a pixel below which a sample's colour is not asked for: a few dozen such change no byte."""
+"""Weight below which a sample's colour is skipped: a few dozen of them do not change 8-bit values."""
 FRUSTUM_DEPTH_FRACTION = 0.06
-"""Depth of a photo's pyramid, as a share of the cameras' distance to what they look at."""
+"""Depth of a photo's frustum, relative to the cameras' distance to the focus."""
 NON_FILENAME_CHARS = re.compile(r"[^\w.-]+")
 
 
 def get_activation_id(field: TensoRFField | VoxelField) -> int:
-    """The map from raw output to density, by its number in march.glsl: exp, relu, softplus."""
-    made = field.activation if isinstance(field, TensoRFField) else torch.exp
-    if isinstance(made, SoftenableReLU):
-        return 2 if made.is_soft else 1
-    return 2 if made is shifted_softplus else 0
+    """Number of the density activation in march.glsl: 0 exp, 1 relu, 2 softplus."""
+    activation = field.activation if isinstance(field, TensoRFField) else torch.exp
+    if isinstance(activation, SoftenableReLU):
+        return 2 if activation.is_soft else 1
+    return 2 if activation is shifted_softplus else 0
 
 
 def encode_cameras(cameras: Cameras) -> dict[str, Any]:
-    """Camera-to-world matrices as rows of three, 32-bit, and lenses: one if all are alike, else of each."""
+    """Encodes camera-to-world matrices [3, 4] in float32, and intrinsics: one if all are equal."""
     rows = cameras.c2w[:, :3].contiguous().numpy().astype("<f4")
     lenses = [
         [width, height, K[0][0], K[1][1], K[0][2], K[1][2]]
         for (width, height), K in zip(cameras.sizes.tolist(), cameras.K.tolist(), strict=True)
     ]
-    alike = all(lens == lenses[0] for lens in lenses)
-    return {"poses": base64.b64encode(rows.tobytes()).decode(), "lenses": lenses[:1] if alike else lenses}
+    shared = all(lens == lenses[0] for lens in lenses)
+    return {"poses": base64.b64encode(rows.tobytes()).decode(), "lenses": lenses[:1] if shared else lenses}
 
 
 def describe_field(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
-    """What the page needs to know of a field besides its compact file.
+    """Parameters of the page's renderer besides the compact file.
 
     Args:
-        system: with planes and lines or voxels, and an occupancy grid.
-        orbit: the views that the turntable shows.
+        system: with a TensoRF or voxel field and an occupancy grid.
+        orbit: views of the turntable.
     """
     field, sampler = system.field, system.sampler
     assert isinstance(field, TensoRFField | VoxelField) and isinstance(sampler, OccupancySampler)
     bounds = sampler.bounds.to("cpu")
-    if bounds.unbounded:  # the same for all rays
+    if bounds.unbounded:  # equal for all rays
         near, far = (float(end) for end in bounds.near_far(Rays(torch.zeros(1, 3), torch.zeros(1, 3))))
-    else:  # ends within the box, if there are any; the page knows the box
+    else:  # near and far limits; the page clips to the box
         near, far = max(bounds.near or 0.0, 0.0), MAX_RAY_DISTANCE if bounds.far is None else bounds.far
     return {
         "kind": "planes" if isinstance(field, TensoRFField) else "voxels",
@@ -94,7 +94,7 @@ def describe_field(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
 
 
 def describe_photos(cameras: Cameras, names: Sequence[str], focus: Float[Tensor, "3"]) -> dict[str, Any]:
-    """Photos to look through, and how deep to draw their pyramids."""
+    """Cameras of photos, and the depth of their frusta."""
     depth = FRUSTUM_DEPTH_FRACTION * float((cameras.centres - focus).norm(dim=1).median())
     return {"names": list(names), "depth": depth, **encode_cameras(cameras.to_pinhole())}
 
@@ -108,15 +108,15 @@ def render_field_page(
     photos: Cameras | None = None,
     names: Sequence[str] = (),
 ) -> str:
-    """The page's HTML. Nothing in it is fetched from anywhere, and nothing that a run's files say is executed.
+    """Renders the page's HTML: loads nothing from elsewhere, and escapes all content of the run.
 
     Args:
         compact: a compact file.
-        system, orbit: what it holds, see `describe_field`.
-        name: of the scene, the page's title.
-        facts: about the field, by name.
-        photos: cameras to look through, if there are any.
-        names: of those.
+        system, orbit: see `describe_field`.
+        name: the scene's, used as title.
+        facts: name and value of each.
+        photos: cameras of photos, if available.
+        names: of the photos.
     """
     about = describe_field(system, orbit)
     about |= {
@@ -139,11 +139,11 @@ def render_field_page(
 
 
 def render_image_page(picture: UInt8[np.ndarray, "H W 3"], name: str, facts: Sequence[tuple[str, str]]) -> str:
-    """The page of an image's field: what the field renders, without loss, and facts about it."""
+    """Renders the page of an image: the lossless render, and facts."""
     image = encode_data_url(picture, "webp")
     return render_page(WEB / "picture.html", [STYLESHEET], IMAGE_SCRIPTS, title=name, facts=facts, image=image)
 
 
 def render_gallery_page(title: str, pages: Sequence[tuple[str, str, str]]) -> str:
-    """Pages side by side, whose views turn together: of each its address, its name, and a line about it."""
+    """Renders a gallery with synchronized views; `pages` are (URL, name, description)."""
     return render_page(WEB / "gallery.html", [WEB / "gallery.css"], [WEB / "gallery.js"], title=title, pages=pages)

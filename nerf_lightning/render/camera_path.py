@@ -1,4 +1,4 @@
-"""Camera paths: which views a video shows."""
+"""Camera paths of videos: orbit, spiral, photos or a file."""
 
 from dataclasses import dataclass
 
@@ -14,19 +14,19 @@ from nerf_lightning.utils.files import expand_user_path
 from nerf_lightning.utils.text import subsample
 
 PHOTO_PATHS = {"test": "val", "train": "train"}
-"""Paths through photos, and their attribute of a scene."""
+"""Paths along photos, and their split of a scene."""
 SPIRAL_FRAMES = 120
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """Views in the order in which they are shown."""
+    """Cameras of a video's frames, in order."""
 
     cameras: Cameras
     views: list[int]
-    """Their numbers among the photos, for captions; without photos, among the path's views."""
+    """Indices among the photos, or among the path's views."""
     photos: Views | None = None
-    """What the views should show, where that is known."""
+    """Ground truth of the views, if known."""
 
 
 def build_path(
@@ -38,23 +38,23 @@ def build_path(
     path_frame: str = "auto",
     scale: float = 1.0,
 ) -> CameraPath:
-    """The views that a name or a file stands for.
+    """Builds a camera path from a name or a file.
 
     Args:
         path: "orbit", "spiral", "test" (held-out photos), "train" (training photos), or a JSON file.
-        frames: how many; None takes as many as there are.
+        frames: number of frames; None takes the path's.
         orbit: the run's.
         scene: with photos, for "test" and "train".
-        to_source: similarity from the run's frame to that of the photos' own file.
+        to_source: similarity from the run's frame to the dataset's.
         path_frame: of a file, see `read_path`.
-        scale: times as many pixels along each side; not beside photos.
+        scale: factor on the width and height; 1 for photos.
 
     Raises:
-        InputError: for a file that is no camera path.
+        InputError: an unknown name, or an invalid file.
     """
     if scene is not None:
         if scale != 1:
-            raise InputError("render", "scale", f"{scale:g}", f"1 beside photos (path {path})")
+            raise InputError("render", "scale", f"{scale:g}", f"1 for photos (path {path})")
         photos: Views = getattr(scene, PHOTO_PATHS[path])
         chosen = subsample(len(photos), frames)
         index = torch.tensor(chosen)

@@ -1,4 +1,4 @@
-"""Frames of a video: what each shows, and its colours."""
+"""Drawing the frames of a video."""
 
 import hashlib
 from dataclasses import replace
@@ -25,16 +25,16 @@ from nerf_lightning.system import NeRF3D
 
 
 def parse_style(system: NeRF3D, path: CameraPath, channels: str, background: str) -> FrameStyle:
-    """How the frames of a path are drawn, from the options `channels` and `background`.
+    """Parses the options `channels` and `background`.
 
     Raises:
-        InputError: for another channel or colour, and for a background that photos cannot have.
+        InputError: an unknown or repeated channel, an invalid colour, or a background that the photos do not have.
     """
     names = tuple(name.strip() for name in channels.split(","))
     if any(name not in CHANNELS for name in names) or len(set(names)) < len(names):
         expected = f"one or more of {', '.join(CHANNELS)}, separated by commas"
         raise InputError("render", "channels", repr(channels), expected)
-    red, green, blue = own = system.renderer.background.color.tolist()
+    red, green, blue = scene_color = system.renderer.background.color.tolist()
     if background not in ("scene", "transparent"):
         try:
             red, green, blue = COLORS.get(background) or map(float, background.split(","))
@@ -45,16 +45,18 @@ def parse_style(system: NeRF3D, path: CameraPath, channels: str, background: str
             raise InputError("render", "background", repr(background), expected)
     if path.photos is not None:
         if background == "transparent":
-            raise InputError("render", "background", background, "a colour beside photos")
-        if path.photos.channels == 3 and not np.allclose((red, green, blue), own, atol=1e-3):
-            expected = f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in own]}"
+            raise InputError("render", "background", background, "a colour, for a path along photos")
+        if path.photos.channels == 3 and not np.allclose((red, green, blue), scene_color, atol=1e-3):
+            expected = (
+                f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in scene_color]}"
+            )
             raise InputError("render", "background", background, expected)
     depths = measure_depth_range(system, path.cameras) if "depth" in names else (0.0, 1.0)
     return FrameStyle(names, None if background == "transparent" else (red, green, blue), depths)
 
 
 def build_manifest(path: str, system: NeRF3D, cameras: CameraPath, style: FrameStyle) -> dict[str, Any]:
-    """Everything that frames depend on, as plain values."""
+    """Plain values that identify all inputs of the frames."""
     digest = hashlib.sha256()
     for tensor in (*system.state_dict().values(), cameras.cameras.K, cameras.cameras.c2w):
         digest.update(tensor.cpu().contiguous().numpy().tobytes())
@@ -69,16 +71,16 @@ def build_manifest(path: str, system: NeRF3D, cameras: CameraPath, style: FrameS
 
 
 def draw_frame(system: NeRF3D, path: CameraPath, style: FrameStyle, index: int) -> Image:
-    """The channels of a view side by side; where there is a photo: photo, render, their difference, and other channels."""
+    """Draws the channels of a view side by side; with a photo: photo, render, error, and other channels."""
     if path.photos is None:
         return np.concatenate(list(render_channels(system, path.cameras, index, style).values()), axis=1)
-    assert style.background is not None  # `parse_style` sees to it
+    assert style.background is not None  # checked by `parse_style`
     pixels = path.photos.image(index)
     background = torch.tensor(style.background).expand(pixels[..., 0].numel(), 3)
     photo = to_uint8(composite_over(pixels.flatten(0, 1), background).view(*pixels.shape[:2], 3))
     others = [name for name in style.channels if name != "rgb"]
-    drawn = render_channels(system, path.cameras, index, replace(style, channels=("rgb", *others)))
-    error, psnr = make_error_image(drawn["rgb"], photo)
+    images = render_channels(system, path.cameras, index, replace(style, channels=("rgb", *others)))
+    error, psnr = make_error_image(images["rgb"], photo)
     names = ["truth", "render", f"{ERROR_GAIN} x error", *others]
     caption = f"{' | '.join(names)}    view {path.views[index]}, {psnr:.2f} dB"
-    return make_panel([photo, drawn["rgb"], error, *(drawn[name] for name in others)], caption)
+    return make_panel([photo, images["rgb"], error, *(images[name] for name in others)], caption)

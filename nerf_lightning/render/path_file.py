@@ -1,4 +1,4 @@
-"""Camera paths from files: this package's, nerfstudio's and instant-ngp's."""
+"""Camera path files of this package, nerfstudio and instant-ngp."""
 
 import math
 from dataclasses import replace
@@ -18,50 +18,50 @@ from nerf_lightning.runs.scene_file import parse_cameras
 from nerf_lightning.utils.parsing import read_json
 
 NGP_SCALE, NGP_OFFSET = 0.33, 0.5
-"""instant-ngp's world is scale * x + offset with axes cycled (nerf_loader.h); a path does not say if a scene sets others."""
+"""instant-ngp's defaults: its world is scale * x + offset with cycled axes (nerf_loader.h)."""
 NGP_AXES = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""From its axes (y, z, x) to the file's."""
+"""Permutation from its axes (y, z, x) to the file's."""
 
 
 def read_path(file: Path, orbit: Cameras, to_source: Float[Tensor, "4 4"], frame: str = "auto") -> Cameras:
-    """A camera path from a JSON file, moved to the run's frame; prints in which frame it was taken to be.
+    """Reads a camera path from a JSON file and transforms it to the run's frame; prints the assumed frame.
 
-    Either of this package's kind (`width`, `height`, `K` 3x3 or a list of them in pixels, `c2w` a list of 4x4 in the OpenCV
-    frame, as `orbit` in a run's scene.json), of nerfstudio's (`render_width`, `render_height`, `camera_path` with
-    `camera_to_world` in the OpenGL frame and the vertical `fov` in degrees), or of instant-ngp's (`path` with quaternions `R`
-    of x, y, z, w, places `T` in its own frame and unit, and the vertical `fov` in degrees).
+    Formats: this package's (`width`, `height`, `K` 3x3 or a list of them in pixels, `c2w` a list of 4x4 in the OpenCV frame,
+    as `orbit` in a run's scene.json); nerfstudio's (`render_width`, `render_height`, `camera_path` with `camera_to_world` in
+    the OpenGL frame and the vertical `fov` in degrees); instant-ngp's (`path` with quaternions `R` as x, y, z, w, positions
+    `T` in its own frame and unit, and the vertical `fov` in degrees).
 
     Args:
         file: JSON.
-        orbit: of the run; its size is that of a path that states none.
-        to_source: from the run's frame to that of the photos' own file.
-        frame: "run", "file", or "auto": this package's paths are in the run's, others in the file's.
+        orbit: the run's; its size is the default.
+        to_source: similarity from the run's frame to the dataset's.
+        frame: "run", "file" (the dataset's), or "auto": run for this package's format, file for others.
 
     Raises:
-        InputError: where it is none of these.
+        InputError: another format, or damaged.
     """
     plain = read_json(file, "a camera path in JSON")
     try:
         if "camera_path" in plain:
-            plain, kind, own = _nerfstudio(plain), "nerfstudio's path", "file"
+            plain, kind, native = _nerfstudio(plain), "nerfstudio's path", "file"
         elif "path" in plain:
-            kind, own = "instant-ngp's path, of scale 0.33 and offset 0.5", "file"
+            kind, native = "instant-ngp's path, of scale 0.33 and offset 0.5", "file"
             plain = _instant_ngp(plain, *orbit.size(0))
         else:
-            kind, own = "a path", "run"
+            kind, native = "a path", "run"
         cameras = parse_cameras(file, "", plain)
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         if isinstance(error, InputError):
             raise
         expected = "give width, height, K and c2w, or nerfstudio's camera_path, or instant-ngp's path"
         raise InputError(file, "", f"no camera path ({type(error).__name__}: {error})", hint=expected) from error
-    taken = own if frame == "auto" else frame
-    where = "the run's frame" if taken == "run" else "the world frame of the photos' own file"
-    print(f"{file}: {kind} in {where} (--path-frame {'file' if taken == 'run' else 'run'} takes the other)")
-    if taken == "run":
+    source_frame = native if frame == "auto" else frame
+    where = "the run's frame" if source_frame == "run" else "the world frame of the photos' own file"
+    print(f"{file}: {kind} in {where} (--path-frame {'file' if source_frame == 'run' else 'run'} takes the other)")
+    if source_frame == "run":
         return cameras
-    moved = transform_poses(cameras.c2w, torch.linalg.inv(to_source.double()))
-    return replace(cameras, c2w=moved.to(cameras.c2w))
+    in_run = transform_poses(cameras.c2w, torch.linalg.inv(to_source.double()))
+    return replace(cameras, c2w=in_run.to(cameras.c2w))
 
 
 def _nerfstudio(plain: dict[str, Any]) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def _nerfstudio(plain: dict[str, Any]) -> dict[str, Any]:
 
 
 def _instant_ngp(plain: dict[str, Any], width: int, height: int) -> dict[str, Any]:
-    """Its cameras look along z with y down, as ours do."""
+    """Its cameras are OpenCV cameras, as ours."""
     poses = np.tile(np.eye(4), (len(plain["path"]), 1, 1))
     for pose, view in zip(poses, plain["path"], strict=True):
         pose[:3, :3] = Rotation.from_quat(np.array(view["R"], np.float64)).as_matrix()
@@ -80,7 +80,7 @@ def _instant_ngp(plain: dict[str, Any], width: int, height: int) -> dict[str, An
 
 
 def _with_fov(views: list[dict[str, Any]], c2w: Any, width: int, height: int) -> dict[str, Any]:
-    """Views by their vertical fields of view, in degrees."""
+    """Cameras as plain values, from vertical fields of view in degrees."""
     focal = [height / (2 * math.tan(math.radians(float(view["fov"])) / 2)) for view in views]
     K = [[[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]] for f in focal]
     return {"width": width, "height": height, "K": K, "c2w": c2w}

@@ -1,4 +1,4 @@
-"""Videos: frames are kept on disk until the video is written, so that an interrupted one can be continued."""
+"""Video writing, resumable: frames are kept on disk until the video is complete."""
 
 import shutil
 from collections.abc import Callable, Iterator
@@ -22,16 +22,16 @@ from nerf_lightning.utils.progress import track_progress
 
 Image = UInt8[ndarray, "H W C"]
 MANIFEST_FILE = "frames.json"
-"""Beside the frames: what they show, so that frames of something else are never reused."""
+"""Stored with the frames; identifies their inputs, so that other frames are never reused."""
 SUFFIXES = (".gif", ".mp4", ".webp")
 OPAQUE_SUFFIXES = (".gif", ".mp4")
-"""Formats without partial transparency."""
+"""Formats without an alpha channel."""
 CRF = 18
-"""Of H.264: smaller is better, 18 looks like the original."""
+"""H.264 quality: lower is better, 18 is visually lossless."""
 
 
 def check_output(output: Path, transparent: bool) -> None:
-    """Raises InputError where no video can be written to a place, before any work is done."""
+    """Checks suffix, transparency and encoder of an output; raises InputError before any work is done."""
     if output.suffix not in ("", *SUFFIXES):
         expected = f"a name ending in {', '.join(SUFFIXES)}, or a folder of PNGs"
         raise InputError("render", "output", output.name, expected)
@@ -42,22 +42,19 @@ def check_output(output: Path, transparent: bool) -> None:
 
 
 def write_video(manifest: dict[str, Any], draw: Callable[[int], Image], count: int, output: Path, fps: float) -> int:
-    """Draws all frames that are not there yet, and joins them.
+    """Draws missing frames and encodes the video; returns the number of frames reused.
 
-    Frames are in the folder itself, or beside a video in a folder of its own until it is written.
+    Frames are in the output folder, or in FILE.frames until the video is complete.
 
     Args:
-        plan: all that the frames depend on, as plain values.
-        draw: makes a frame.
-        count: how many.
-        output: a folder, or a file whose suffix says what kind of video.
+        manifest: see `build_manifest`.
+        draw: draws the frame of an index.
+        count: number of frames.
+        output: a folder, or a file whose suffix selects the format.
         fps: frames per second.
 
-    Returns:
-        How many frames were there already.
-
     Raises:
-        InputError: where the folder holds something else.
+        InputError: the folder holds something else.
     """
     folder = output.with_name(f"{output.name}.frames") if output.suffix else output
     files = [folder / f"{index:05d}.png" for index in range(count)]
@@ -65,8 +62,8 @@ def write_video(manifest: dict[str, Any], draw: Callable[[int], Image], count: i
     missing = [index for index in range(count) if not files[index].exists()]
     for index in track_progress(missing, len(missing), "frames"):
         image = draw(index)
-        if index == missing[0]:  # nothing is left of a video of which not even a frame can be drawn
-            if output.suffix == ".webp":  # whose writer keeps all frames in memory
+        if index == missing[0]:  # write nothing if the first frame fails
+            if output.suffix == ".webp":  # the writer keeps all frames in memory
                 needed = 4 * count * image[..., 0].size
                 check_memory("render", "frames", f"{count:,} frames", needed, "give less, or -o FILE.mp4")
             write_json(folder / MANIFEST_FILE, manifest)
@@ -80,16 +77,16 @@ def write_video(manifest: dict[str, Any], draw: Callable[[int], Image], count: i
 
 
 def prepare_folder(folder: Path, manifest: dict[str, Any], is_owned: bool) -> None:
-    """Makes way for the frames of a plan: those of another plan are deleted if the folder is `is_owned`.
+    """Removes frames of another manifest if the folder `is_owned`.
 
     Raises:
-        InputError: where it is not, and holds something else.
+        InputError: the folder is not owned, and holds something else.
     """
     try:
-        found = read_json(folder / MANIFEST_FILE, "a plan of frames")
-    except InputError:  # none there, or none whole
-        found = None
-    if found != manifest and folder.exists():
+        stored = read_json(folder / MANIFEST_FILE, "a plan of frames")
+    except InputError:  # missing or damaged
+        stored = None
+    if stored != manifest and folder.exists():
         if is_owned:
             shutil.rmtree(folder)
         elif any(folder.iterdir()):
@@ -97,7 +94,7 @@ def prepare_folder(folder: Path, manifest: dict[str, Any], is_owned: bool) -> No
 
 
 def read_frames(files: list[Path]) -> Iterator[Image]:
-    """Frames on disk, those of smaller photos in the middle of a black or transparent frame of the size of the largest."""
+    """Yields frames from disk, padded with black or transparent borders to the largest size."""
     sizes = [read_image_size(file)[:2] for file in files]
     width, height = (max(sides) for sides in zip(*sizes, strict=True))
     for file, (w, h) in zip(files, sizes, strict=True):
@@ -106,9 +103,9 @@ def read_frames(files: list[Path]) -> Iterator[Image]:
 
 
 def encode_video(files: list[Path], output: Path, fps: float) -> None:
-    """Frames on disk -> one video, of the kind that its suffix says.
+    """Encodes frames on disk as a video; the suffix selects the format.
 
-    H.264 has colours at half resolution, which every player knows; odd sizes get one more row or column, never a resize.
+    H.264 uses yuv420p, which all players support; odd sizes are padded by a row or column.
     """
     if output.suffix != ".mp4":
         write_animation(output, read_frames(files), 1 / fps)

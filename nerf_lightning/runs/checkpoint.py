@@ -1,4 +1,4 @@
-"""Checkpoints as they are read back: tensors and plain values, whole to the last bit, and never code."""
+"""Safe loading of checkpoints: checksums verified, tensors and plain values only."""
 
 import pickle
 import warnings
@@ -15,19 +15,18 @@ from nerf_lightning.utils.parsing import DAMAGE_ERRORS, require_file
 
 RENDER_KEYS = ("state_dict",)
 RESUME_KEYS = (*RENDER_KEYS, "loops", "callbacks", "optimizer_states", "lr_schedulers", "epoch", "global_step")
-"""What rendering and training need, as Lightning writes it."""
+"""Checkpoint entries, as Lightning names them, that rendering and resuming need."""
 
 
 def read_checkpoint(path: Path, keys: Sequence[str] = RENDER_KEYS) -> dict[str, Any]:
     """Reads a checkpoint with the given keys.
 
-    It is an archive with a checksum (CRC-32) of each part. PyTorch does not compare them when it loads: here they are compared
-    first, which takes half as long as loading does.
+    Verifies the CRC-32 of each archive member first, which PyTorch does not; this takes half as long as loading.
 
     Raises:
-        InputError: the file is missing, truncated, changed since it was written, larger than memory, or no state.
+        InputError: the file is missing, damaged, larger than free memory, or no checkpoint.
     """
-    require_file(path, "a checkpoint", "the run may have ended before its first one")
+    require_file(path, "a checkpoint", "the run may have ended before its first checkpoint")
     try:
         with zipfile.ZipFile(path) as archive:
             check_memory(path, "", "a checkpoint", sum(part.file_size for part in archive.infolist()))
@@ -35,7 +34,7 @@ def read_checkpoint(path: Path, keys: Sequence[str] = RENDER_KEYS) -> dict[str, 
         if damaged is not None:
             raise InputError(path, damaged, "damaged: its checksum differs", hint="copy it again")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # about kinds of files that are refused below
+            warnings.simplefilter("ignore")  # about file types that are rejected below
             state = torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, *DAMAGE_ERRORS) as error:
         if isinstance(error, InputError):
@@ -48,12 +47,12 @@ def read_checkpoint(path: Path, keys: Sequence[str] = RENDER_KEYS) -> dict[str, 
 
 
 def check_finite(module: torch.nn.Module, where: object) -> None:
-    """Refuses weights that are not finite: training keeps them finite unless it has broken down.
+    """Checks that all weights are finite: NaN and infinity mean that training diverged.
 
     Raises:
-        InputError: for the first.
+        InputError: for the first tensor that is not.
     """
     for name, tensor in module.state_dict().items():
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
-            hint = "the run has broken down: see its results.json"
+            hint = "training diverged: see the run's results.json"
             raise InputError(where, name, "weights are not finite", hint=hint)

@@ -1,8 +1,8 @@
-"""The compact file: a trained system, ready to render, in few bytes: one .npz of plain arrays.
+"""The compact file: a pruned, quantized trained system, as one .npz of plain arrays.
 
-header                     JSON as bytes: format, version, config, scene, and how each array is coded
-field.NAME, sampler.NAME   parameters as half floats, or as bytes between the minimum and maximum of their column; masks as bits
-NAME:range                 minimum and maximum of each column that is coded as bytes
+header                     JSON as bytes: format, version, config, scene, and the encoding of each array
+field.NAME, sampler.NAME   parameters as float16, or as uint8 between the minimum and maximum of their column; masks as bits
+NAME:range                 minimum and maximum of each uint8 column
 """
 
 import io
@@ -27,17 +27,17 @@ from nerf_lightning.utils.parsing import VALUE_ERRORS, parse_json, read_file, re
 
 FORMAT, VERSION = "nerf_lightning compact", 1
 MIN_QUANTIZED_SIZE = 2048
-"""Arrays with at least this many numbers are coded as bytes; smaller ones, such as networks, stay half floats."""
+"""Minimum number of entries of an array stored as uint8; smaller ones, such as networks, stay float16."""
 MAX_HEADER_BYTES = 16 << 20
-"""Of JSON, which takes up to 32 times as much memory: a thousand cameras are 4 MB. Compressed, zeros are a thousandth."""
+"""Limit for the decompressed JSON, which takes up to 32 times the memory; a thousand cameras are 4 MB."""
 Arrays = dict[str, Any]  # of numpy arrays
 
 
 def encode(system: System, precision: str, config: dict[str, Any], scene: dict[str, Any]) -> bytes:
-    """Codes a system as the content of a compact file.
+    """Encodes a system as the content of a compact file.
 
     Args:
-        system: trained; see `prune_to_cells` to leave out what no camera sees.
+        system: trained; `prune_to_cells` removes what no camera sees.
         precision: "half" or "byte".
         config, scene: of its run, see `runs.folder`.
     """
@@ -49,9 +49,9 @@ def encode(system: System, precision: str, config: dict[str, Any], scene: dict[s
             code = "bits" if tensor.dtype == torch.bool else "half" if name in learned else "exact"
             if code == "half" and precision == "byte" and tensor.numel() >= MIN_QUANTIZED_SIZE:
                 code = "byte"
-            whole = f"{part}.{name}"
-            codes[whole] = {"code": code, "shape": list(tensor.shape)}
-            arrays |= _quantize(whole, tensor.detach().cpu().numpy(), code)
+            key = f"{part}.{name}"
+            codes[key] = {"code": code, "shape": list(tensor.shape)}
+            arrays |= _quantize(key, tensor.detach().cpu().numpy(), code)
     header = {"format": FORMAT, "version": VERSION, "config": config, "scene": scene, "arrays": codes}
     return _pack(header, arrays)
 
@@ -60,11 +60,11 @@ def _quantize(name: str, array: np.ndarray, code: str) -> Arrays:
     if code == "bits":
         return {name: np.packbits(array.reshape(-1))}
     if code == "half":
-        most = np.finfo(np.float16).max
-        return {name: array.clip(-most, most).astype(np.float16)}
+        limit = np.finfo(np.float16).max
+        return {name: array.clip(-limit, limit).astype(np.float16)}
     if code == "exact":
         return {name: array}
-    # Pruned entries are zero and would only widen the range.
+    # Pruned entries are zero and would widen the range.
     rows = array.reshape(len(array), -1) if array.ndim < 3 else array.reshape(-1, array.shape[-1])
     used = rows[rows.any(1)] if rows.any() else rows
     low, high = used.min(0), used.max(0)
@@ -92,15 +92,14 @@ def _dequantize(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tenso
 
 
 def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> LoadedRun:
-    """A system, ready to render, from what `encode` gave.
+    """Decodes a compact file into a system ready to render.
 
     Args:
         content: of a compact file.
-        path: where it came from, for messages.
-        device: where to render.
+        path: its origin, for messages.
 
     Raises:
-        InputError: if it is not a compact file, is damaged, of another version, or names something not trusted.
+        InputError: the content is no compact file, damaged, of another version, or names an untrusted class.
     """
     header, arrays = _unpack(content, path)
     try:
@@ -108,7 +107,9 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> Load
         cfg = parse_config(header["config"], path)
         with attribute_errors_to(path):
             system = build_system(cfg, frame, device)
-        tensors = {key: _dequantize(key, arrays, one["code"], one["shape"]) for key, one in header["arrays"].items()}
+        tensors = {
+            key: _dequantize(key, arrays, entry["code"], entry["shape"]) for key, entry in header["arrays"].items()
+        }
         for part, module in system.exportable_modules.items():
             prefix = f"{part}."
             module.import_state({key[len(prefix) :]: value for key, value in tensors.items() if key.startswith(prefix)})
@@ -121,11 +122,7 @@ def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> Load
 
 
 def _unpack(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]:
-    """The header and the arrays of a compact file.
-
-    Raises:
-        InputError: as `decode`.
-    """
+    """The header and the arrays of a compact file."""
     expected = "a compact file of this package"
     arrays = read_npz(content, None, path, expected)
     require_keys(path, arrays, ["header"])
@@ -141,17 +138,17 @@ def _unpack(content: bytes, path: Path | str) -> tuple[dict[str, Any], Arrays]:
 
 
 def strip_local_paths(content: bytes) -> bytes:
-    """The content of a compact file to be given away: of each path on this machine only its last name is left."""
+    """Replaces absolute paths in a compact file's header by their last component."""
 
-    def bare(node: Any) -> Any:
+    def strip(node: Any) -> Any:
         if isinstance(node, dict):
-            return {key: bare(value) for key, value in node.items()}
+            return {key: strip(value) for key, value in node.items()}
         if isinstance(node, list):
-            return [bare(value) for value in node]
+            return [strip(value) for value in node]
         return Path(node).name if isinstance(node, str) and Path(node).is_absolute() else node
 
     header, arrays = _unpack(content, "compact")
-    return _pack(bare(header), arrays)
+    return _pack(strip(header), arrays)
 
 
 def _pack(header: dict[str, Any], arrays: Arrays) -> bytes:
@@ -161,10 +158,6 @@ def _pack(header: dict[str, Any], arrays: Arrays) -> bytes:
 
 
 def load_compact(path: Path, device: torch.device = CPU) -> LoadedRun:
-    """Reads a compact file, ready to render on a device.
-
-    Raises:
-        InputError: as `decode`, and where there is no such file.
-    """
+    """Reads a compact file, ready to render on a device; raises as `decode`, and for a missing file."""
     require_file(path, "a compact file", "nerf_lightning export compact makes one")
     return decode(read_file(path), path, device)

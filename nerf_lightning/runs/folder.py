@@ -1,4 +1,4 @@
-"""The run folder: what a run writes, and how it is read back without trusting it.
+"""The run folder: its files, and safe loading.
 
 config.yaml            the resolved configuration
 scene.json             bounds, background and orbit of the scene, so that rendering needs no photos; corrected cameras
@@ -38,24 +38,24 @@ from nerf_lightning.utils.option_checks import check_options
 from nerf_lightning.utils.parsing import VALUE_ERRORS, read_yaml, require_file
 
 COMMAND_KEYS = ("overwrite", "version")
-"""Keys of a configuration that are not those of the run that was made with it."""
+"""Config keys of a command rather than of the run."""
 VERSION = ".".join(nerf_lightning.__version__.split(".")[:2])
-"""Of this package, as runs are marked with: those of another one are refused."""
+"""Package version stored with runs; runs of other versions are rejected."""
 TRUSTED_PACKAGES_VARIABLE = "NERF_LIGHTNING_TRUSTED_PACKAGES"
-"""Environment variable: further packages, comma-separated, whose classes a run folder may name."""
+"""Environment variable: comma-separated packages whose classes a run's configuration may name."""
 SWEEP_CALLBACK = "nerf_lightning.training.sweep.SweepReport"
-"""Hydra's, never in a run's configuration."""
+"""Hydra callback, never part of a run's configuration."""
 
 
 @functools.cache
 def list_shipped_targets() -> frozenset[str]:
-    """What the shipped configuration builds. Anything else could be called with a stranger's arguments."""
+    """Targets of the shipped configuration: the only ones a run may instantiate by default."""
     texts = "".join(file.read_text(encoding="utf-8") for file in conf_dir().rglob("*.yaml"))
     return frozenset(re.findall(r"_target_: ([\w.]+)", texts)) - {SWEEP_CALLBACK}
 
 
 def config_to_dict(cfg: DictConfig) -> dict[str, Any]:
-    """The resolved configuration; a relative dataset path becomes absolute, so that it is valid from any folder."""
+    """The resolved configuration as plain values, with an absolute dataset path."""
     plain = {"version": VERSION} | {key: value for key, value in resolve_config(cfg).items() if key not in COMMAND_KEYS}
     path = plain["dataset"].get("path")
     if path is not None:
@@ -64,15 +64,14 @@ def config_to_dict(cfg: DictConfig) -> dict[str, Any]:
 
 
 def save_config(cfg: DictConfig, folder: Path) -> None:
-    """Writes the resolved configuration."""
     write_text(folder / "config.yaml", yaml.safe_dump(config_to_dict(cfg), sort_keys=False))
 
 
 def load_config(folder: Path) -> DictConfig:
-    """Reads a run's configuration; refuses anything that would run code from outside the package.
+    """Loads a run's configuration; never instantiates untrusted classes.
 
     Raises:
-        InputError: if the file is missing, broken or cut short, holds interpolations, or names a target that is not trusted.
+        InputError: the file is missing or damaged, holds interpolations, or names an untrusted target.
     """
     path = folder / "config.yaml"
     require_file(path, "the folder of a run", "look below outputs/")
@@ -80,25 +79,25 @@ def load_config(folder: Path) -> DictConfig:
 
 
 def parse_config(plain: Any, path: Path | str) -> DictConfig:
-    """As `load_config`, of what a file at `path` holds."""
+    """As `load_config`, for the parsed content of the file `path`."""
     if not isinstance(plain, dict):
         raise InputError(path, "", type(plain).__name__, "a mapping")
     check_config(path, "", plain)
     if (version := plain.get("version")) != VERSION:
-        found = "no version" if version is None else f"version {version}"
+        problem = "no version" if version is None else f"version {version}"
         hint = "train the run again, or use the version of nerf_lightning that made it"
-        raise InputError(path, "version", found, f"version {VERSION}, which this one reads", hint)
+        raise InputError(path, "version", problem, f"version {VERSION}, which this one reads", hint)
     known = {field.name for field in fields(RunOptions)}
     options = {key: value for key, value in plain.items() if key in known}
     check_options("", RunOptions, options, COMMAND_KEYS, source=str(path))
     try:
-        return OmegaConf.create(escape_interpolations(plain))  # text from outside is never an interpolation
+        return OmegaConf.create(escape_interpolations(plain))  # untrusted text is never an interpolation
     except RecursionError as error:
         raise InputError(path, "", "values are nested too deep") from error
 
 
 def check_config(path: Path | str, key: str, node: Any) -> None:
-    """Raises InputError for anything in a configuration from outside but plain finite values and trusted targets."""
+    """Checks that an untrusted configuration holds only plain finite values and trusted targets."""
     if isinstance(node, dict):
         for name, value in node.items():
             if name == "_target_" and not _is_trusted(value):
@@ -121,7 +120,7 @@ def check_config(path: Path | str, key: str, node: Any) -> None:
 
 
 def _is_trusted(target: Any) -> bool:
-    """Whether a target is on the list, or defined (not merely imported) in a package that the user trusts."""
+    """Whether a target is shipped, or defined (not merely imported) in a package the user trusts."""
     if str(target) in list_shipped_targets():
         return True
     module, _, name = str(target).rpartition(".")
@@ -129,31 +128,31 @@ def _is_trusted(target: Any) -> bool:
     if not package or package not in os.environ.get(TRUSTED_PACKAGES_VARIABLE, "").split(","):
         return False
     try:
-        found = getattr(importlib.import_module(module), name, None)
+        value = getattr(importlib.import_module(module), name, None)
     except ImportError:
         return False
-    return getattr(found, "__module__", "").split(".")[0] == package
+    return getattr(value, "__module__", "").split(".")[0] == package
 
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A run read back, ready to render."""
+    """A loaded run, ready to render."""
 
     cfg: DictConfig
     system: System
     orbit: Cameras | None
-    """None for a picture."""
+    """None for an image."""
     to_source: Float[Tensor, "4 4"] | None
-    """Similarity transform from the world frame to that of the photos' file; None for a picture."""
+    """Similarity transform from the world frame to the dataset's frame; None for an image."""
     scene: dict[str, Any]
-    """The content of scene.json."""
+    """Content of scene.json."""
 
 
 def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device = CPU) -> LoadedRun:
-    """Rebuilds a trained system from its folder alone, on a device.
+    """Loads a trained system from its run folder.
 
     Raises:
-        InputError: if a file is missing, broken, or does not match the others.
+        InputError: a file is missing, damaged, or inconsistent with the others.
     """
     cfg, scene = load_config(folder), read_scene_file(folder)
     frame, orbit, to_source = parse_metadata(scene, folder / "scene.json")
@@ -162,7 +161,7 @@ def load_run(folder: Path, checkpoint: str = "last.ckpt", device: torch.device =
     path = folder / "checkpoints" / checkpoint
     state = read_checkpoint(path)
     try:
-        # Corrections are of training photos, which rendering has none of.
+        # Corrections belong to training photos, which rendering does not need.
         weights = {key: value for key, value in state["state_dict"].items() if not key.startswith("corrections.")}
         system.load_state_dict(weights)
     except VALUE_ERRORS as error:

@@ -1,4 +1,4 @@
-"""Opens a run by its path: a folder, or the compact file made from one."""
+"""Opening runs: a folder or a compact file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ from nerf_lightning.utils.libraries import silence_lightning
 
 @dataclass(frozen=True)
 class LoadedSceneRun(LoadedRun):
-    """As `LoadedRun`, for a scene."""
+    """A loaded run of a 3D scene."""
 
     system: NeRF3D
     orbit: Cameras
@@ -26,34 +26,34 @@ class LoadedSceneRun(LoadedRun):
 
     @property
     def scale(self) -> float:
-        """Length of a world unit in the frame of the photos' own file."""
+        """Length of a world unit in the dataset's frame."""
         return float(torch.linalg.det(self.to_source[:3, :3])) ** (1 / 3)
 
 
 def open_run(path: Path, device: torch.device) -> LoadedRun:
-    """Reads a trained system, ready to render on a device with the kernels it was trained with.
+    """Loads a run, ready to render with the kernels it was trained with.
 
     Raises:
-        InputError: if there is none, or it is broken, of another version, or names something not trusted.
+        InputError: the run is missing, damaged, of another version, or names an untrusted class.
     """
     silence_lightning()
-    found = load_compact(path, device) if path.suffix == ".npz" else load_run(path, device=device)
-    set_kernels(found.cfg.kernels)
-    return found
+    run = load_compact(path, device) if path.suffix == ".npz" else load_run(path, device=device)
+    set_kernels(run.cfg.kernels)
+    return run
 
 
 def open_scene_run(path: Path, device: torch.device) -> LoadedSceneRun:
-    """As `open_run`, of a scene.
+    """As `open_run`, for a 3D scene.
 
     Raises:
-        InputError: as there, and for a picture's run.
+        InputError: also for the run of an image.
     """
-    found = open_run(path, device)
-    if found.orbit is None:
-        raise InputError(path, "", "a picture's run", "a scene's run", "final.png shows a picture")
-    return LoadedSceneRun(**vars(found))
+    run = open_run(path, device)
+    if run.orbit is None:
+        raise InputError(path, "", "the run of an image", "the run of a scene", "see its final.png")
+    return LoadedSceneRun(**vars(run))
 
 
 def get_output_folder(path: Path) -> Path:
-    """Where to write what is made from a run: its folder, or the one its compact file is in."""
+    """Default output folder of a run: its folder, or the parent of its compact file."""
     return path.parent if path.suffix == ".npz" else path

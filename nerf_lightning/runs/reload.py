@@ -1,4 +1,4 @@
-"""The photos or picture for a run that is read back: those it was trained on, or others. Nothing is downloaded."""
+"""Reloading a run's photos, or other photos of the same scene. Nothing is downloaded."""
 
 import copy
 import math
@@ -20,46 +20,47 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.runs.scene_file import parse_metadata
 
 MAX_FRAME_DIFFERENCE = 1e-5
-"""Frames that differ less, in entries of the similarity between them, are one: in the unit of the run's own."""
+"""Largest difference, in entries of the similarity between them, at which two frames count as equal."""
 
 
 def align_scene(scene: Any, content: Mapping[str, Any]) -> Any:
-    """A scene in the frame that a run was trained in, which other photos of it, or a later version of this package, may place
-    and turn in another way: both know the frame of the files they came from.
+    """Transforms a scene into the frame that a run was trained in, via the dataset's frame that both know.
+
+    Other photos, or a later version of this package, may normalize the scene differently.
 
     Args:
-        scene: just read; a picture stays as it is.
+        scene: newly read; an image is returned unchanged.
         content: of the run's scene.json.
     """
     frame, _, to_source = parse_metadata(content, "scene.json") if "aabb" in content else (None, None, None)
     if to_source is None or not isinstance(frame, SceneMetadata):
         return scene
-    moved = torch.linalg.solve(to_source, scene.to_source)
-    if torch.allclose(moved, torch.eye(4, dtype=moved.dtype), atol=MAX_FRAME_DIFFERENCE):
+    to_run = torch.linalg.solve(to_source, scene.to_source)
+    if torch.allclose(to_run, torch.eye(4, dtype=to_run.dtype), atol=MAX_FRAME_DIFFERENCE):
         return replace(scene, bounds=frame.bounds, to_source=to_source)
 
-    def placed(cameras: Cameras) -> Cameras:
-        return replace(cameras, c2w=transform_poses(cameras.c2w, moved).float())
+    def transform(cameras: Cameras) -> Cameras:
+        return replace(cameras, c2w=transform_poses(cameras.c2w, to_run).float())
 
     splits = {name: getattr(scene, name) for name in ("train", "val", "test")}
-    views = {name: one and replace(one, cameras=placed(one.cameras)) for name, one in splits.items()}
-    points = None if scene.points is None else transform_points(moved, scene.points.double()).float()
-    kept = {"bounds": frame.bounds, "to_source": to_source}
-    return replace(scene, **views, **kept, orbit=placed(scene.orbit), points=points)
+    views = {name: split and replace(split, cameras=transform(split.cameras)) for name, split in splits.items()}
+    points = None if scene.points is None else transform_points(to_run, scene.points.double()).float()
+    frame_fields = {"bounds": frame.bounds, "to_source": to_source}
+    return replace(scene, **views, **frame_fields, orbit=transform(scene.orbit), points=points)
 
 
 def apply_refined_cameras(scene: Any, content: Mapping[str, Any]) -> Any:
-    """A run's scene with its training cameras as the training has corrected them, if it has.
+    """A run's scene with refined training cameras, if the run has any.
 
     Raises:
-        InputError: where those are not as many poses as there are photos, or the factor on the focal length is none.
+        InputError: the number of poses differs from that of the photos, or the focal factor is invalid.
     """
     if "corrected" not in content:
         return scene
     cameras = scene.train.cameras
     poses = checks.check_poses("scene.json", "corrected[{}]", content["corrected"])
     if len(poses) != len(cameras):
-        expected, hint = f"{len(cameras)} poses, one of each training photo", "have photos been added or removed?"
+        expected, hint = f"{len(cameras)} poses, one per training photo", "have photos been added or removed?"
         raise InputError("scene.json", "corrected", f"{len(poses)} poses", expected, hint)
     c2w = torch.from_numpy(poses).float()
     factor = content.get("focal_factor")
@@ -73,26 +74,26 @@ def apply_refined_cameras(scene: Any, content: Mapping[str, Any]) -> Any:
 def reload_data(
     cfg: DictConfig, scene: Mapping[str, Any], photos: str | Path | None = None, corrected: bool = True
 ) -> DataModule:
-    """The data module of a run. The network is never used, as the run may be a stranger's.
+    """The data module of a run; never downloads, as the run is not trusted.
 
     Args:
         cfg: the run's configuration.
-        scene: what its scene.json says.
-        photos: a file or folder of others; None takes those it was trained on.
-        corrected: whether those are seen by cameras as training has corrected them.
+        scene: content of its scene.json.
+        photos: a file or folder of other photos; None: the training photos.
+        corrected: whether training photos get their refined cameras.
 
     Raises:
-        InputError: if they are gone, or have changed.
+        InputError: the photos are missing or have changed.
     """
     source = scene.get("source", BUILT_IN)
-    at_hand = copy.deepcopy(cfg)
-    if "url" in at_hand.dataset:
-        at_hand.dataset.download = False
-        if at_hand.dataset.get("path") is None and source != BUILT_IN:
-            at_hand.dataset.path = escape_interpolations(source)
-    if at_hand.dataset.get("resize") == AUTO and "longest" in scene:
-        at_hand.dataset.resize = scene["longest"]
-    data = build_data(at_hand, photos)
+    local = copy.deepcopy(cfg)
+    if "url" in local.dataset:
+        local.dataset.download = False
+        if local.dataset.get("path") is None and source != BUILT_IN:
+            local.dataset.path = escape_interpolations(source)
+    if local.dataset.get("resize") == AUTO and "longest" in scene:
+        local.dataset.resize = scene["longest"]
+    data = build_data(local, photos)
     data.scene = align_scene(data.scene, scene)
     if photos is None and corrected:
         data.scene = apply_refined_cameras(data.scene, scene)

@@ -1,4 +1,4 @@
-"""Who a run's folder belongs to: one process at a time, and to one run until somebody asks to replace it."""
+"""Locks on run folders: one process at a time, one run unless overwriting is requested."""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,27 +13,26 @@ from nerf_lightning.runs.find import RUN_MARKER
 from nerf_lightning.utils.files import remove_empty_folders, remove_path
 
 LOCK_FILE = ".lock"
-"""In a folder that is or was written."""
 RUN_OUTPUTS = ("config.yaml", "results.json", "checkpoints")
-"""Any of these says that a folder holds a run."""
+"""Files that mark a folder as a run."""
 
 
 class RunFolderInUse(InputError):
-    """A folder belongs to another run."""
+    """The folder belongs to another run."""
 
 
 def is_rank_zero() -> bool:
-    """Whether this process is the first, or the only one, of those that share a run: the others write nothing."""
+    """Whether this process is the one that writes, of those that share a run."""
     return getattr(rank_zero_only, "rank", 0) == 0
 
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Locks a folder, which is made if it is missing, and removed again if nothing was written.
+    """Creates and locks a folder; removes it again if nothing was written.
 
     Raises:
-        Taken: while another process writes into it.
-        InputError: where it holds files of others and no run.
+        RunFolderInUse: another process writes into it.
+        InputError: the folder holds other files and no run.
     """
     if not is_rank_zero():
         yield
@@ -45,8 +44,8 @@ def lock_folder(folder: Path) -> Iterator[None]:
     try:
         lock.acquire()
     except Timeout as error:
-        hint = "wait for its end, or give another folder"
-        raise RunFolderInUse(folder, "", "a run is in progress in it", hint=hint) from error
+        hint = "wait until it ends, or give another folder"
+        raise RunFolderInUse(folder, "", "another run is writing into it", hint=hint) from error
     if is_empty(folder):
         (folder / RUN_MARKER).touch()
     try:
@@ -61,34 +60,33 @@ def lock_folder(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def lock_new_run_folder(folder: Path, overwrite: bool, allow_suffix: bool = False) -> Iterator[Path]:
-    """Locks a folder for a run that starts anew; yields it.
+    """Locks a folder for a new run and yields it.
 
     Args:
-        folder: as asked for.
-        overwrite: whether it may hold a run, which `delete_run_outputs` then removes.
-        renamed: whether `folder-2`, `folder-3`, ... will do as well, where another run has it.
+        folder: requested folder.
+        overwrite: allow an existing run, which `delete_run_outputs` then removes.
+        allow_suffix: fall back to `folder-2`, `folder-3`, ... if the folder holds a run.
 
     Raises:
-        Taken: where another run has it, in progress or not.
+        RunFolderInUse: the folder holds another run, finished or not.
         InputError: as `lock_folder`.
     """
     for number in count(1):
-        place = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
+        candidate = folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
         with ExitStack() as stack:
             try:
-                stack.enter_context(lock_folder(place))
-                if is_rank_zero() and has_run_outputs(place) and (allow_suffix or not overwrite):
-                    raise make_run_exists_error(place)
+                stack.enter_context(lock_folder(candidate))
+                if is_rank_zero() and has_run_outputs(candidate) and (allow_suffix or not overwrite):
+                    raise make_run_exists_error(candidate)
             except RunFolderInUse:
                 if allow_suffix:
                     continue
                 raise
-            yield place
+            yield candidate
             return
 
 
 def make_run_exists_error(folder: Path) -> RunFolderInUse:
-    """The error for a folder that holds a run."""
     hint = f"resume={folder} continues it, overwrite=true replaces it"
     return RunFolderInUse(folder, "", "holds a run already", hint=hint)
 
@@ -98,13 +96,12 @@ def has_run_outputs(folder: Path) -> bool:
 
 
 def is_empty(folder: Path) -> bool:
-    """Whether there is nothing but a lock and a marker."""
+    """Whether a folder holds nothing but a lock and a marker."""
     return all(file.name in (LOCK_FILE, RUN_MARKER) for file in folder.iterdir())
 
 
 def delete_run_outputs(folder: Path) -> None:
-    """Removes an earlier run, so that none of its files is mistaken for a later one's: all files of a marked folder, elsewhere
-    only those that say that there is a run."""
+    """Deletes an earlier run: all files of a marked folder, elsewhere only `RUN_OUTPUTS`."""
     if not has_run_outputs(folder):
         return
     marked = (folder / RUN_MARKER).exists()

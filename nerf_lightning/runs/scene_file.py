@@ -1,4 +1,4 @@
-"""scene.json of a run: what rendering needs to know about the scene, without its photos."""
+"""scene.json: what rendering a run needs to know of its scene, without photos."""
 
 import os
 from collections.abc import Mapping
@@ -23,8 +23,7 @@ EXPECTED_CONTENT = "the scene of a run, whole"
 def save_scene(
     data: DataModule, folder: Path, corrected: Cameras | None = None, focal_factor: float | None = None
 ) -> None:
-    """Writes what rendering needs of the scene, without its photos, and the training cameras if training has corrected them,
-    perhaps with a factor on their focal length."""
+    """Writes scene.json, with refined training cameras and the factor on their focal length, if any."""
     content = scene_to_dict(data)
     if corrected is not None:
         content |= {"corrected": corrected.c2w.tolist(), "focal_factor": focal_factor}
@@ -32,14 +31,14 @@ def save_scene(
 
 
 def scene_to_dict(data: DataModule) -> dict[str, Any]:
-    """The same as plain values."""
+    """The content of scene.json as plain values."""
     scene, frame = data.scene, get_metadata(data)
     content: dict[str, Any] = dict(scene.describe())
     if scene.source != BUILT_IN:
         content["source"] = os.path.abspath(scene.source)
     if isinstance(frame, SceneMetadata):
         content |= {
-            # Of any photo: `resize=auto` chooses by the budget, device and memory, which differ when the run is opened again.
+            # `resize=auto` depends on budget, device and memory, which may differ when the run is reopened.
             "longest": max(views.cameras.max_side for views in (scene.train, scene.val)),
             "background": list(frame.background),
             "aabb": frame.bounds.aabb.tolist(),
@@ -59,10 +58,10 @@ def scene_to_dict(data: DataModule) -> dict[str, Any]:
 
 
 def read_scene_file(folder: Path) -> dict[str, Any]:
-    """The content of a run's scene.json, whose values `parse_metadata` checks.
+    """Reads scene.json; `parse_metadata` checks its values.
 
     Raises:
-        InputError: where it is missing or broken.
+        InputError: the file is missing or damaged.
     """
     path = folder / "scene.json"
     scene = read_json(path, EXPECTED_CONTENT, "")
@@ -72,14 +71,14 @@ def read_scene_file(folder: Path) -> dict[str, Any]:
 
 
 def parse_metadata(scene: Mapping[str, Any], where: object) -> tuple[Metadata, Cameras | None, Tensor | None]:
-    """Reads what `scene_to_dict` gave: a system's frame, the orbit, and the transform to the source; None for a picture.
+    """Parses scene.json: a system's metadata, the orbit, and the transform to the dataset's frame; both None for an image.
 
     Args:
-        scene: read back from a file.
-        where: that file, for messages.
+        scene: content of the file.
+        where: the file, for messages.
 
     Raises:
-        InputError: where a value is missing or cannot be.
+        InputError: a value is missing or invalid.
     """
     try:
         if "aabb" not in scene:
@@ -99,10 +98,10 @@ def parse_metadata(scene: Mapping[str, Any], where: object) -> tuple[Metadata, C
 
 
 def parse_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
-    """Cameras from plain values: `width`, `height`, `K` (one or of each view, pixels) and `c2w` (OpenCV frame).
+    """Cameras from plain values: `width`, `height`, `K` (shared or per view, pixels) and `c2w` (OpenCV frame).
 
     Raises:
-        InputError: for poses that are no rotations, intrinsics that cannot be, and no view at all.
+        InputError: invalid poses or intrinsics, or no view.
         LookupError: for a missing key.
     """
     width, height = checks.check_view_size(where, key, views["width"], views["height"])
@@ -110,7 +109,7 @@ def parse_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
     K = checks.parse_floats(where, f"{key}K", views["K"])
     if not len(c2w) or K.shape not in ((3, 3), (len(c2w), 3, 3)):
         found = f"shape {K.shape} for {len(c2w)} views"
-        raise InputError(where, f"{key}K", found, "shape (V, 3, 3), of at least one view")
+        raise InputError(where, f"{key}K", found, "shape (V, 3, 3) with at least one view")
     K = np.stack(
         [checks.check_intrinsics(where, f"{key}K", one, width, height) for one in np.broadcast_to(K, (len(c2w), 3, 3))]
     )

@@ -1,4 +1,4 @@
-"""Run folders as tables and charts read them: tolerant of broken ones, never executing what they hold."""
+"""Run summaries for tables and charts: tolerant of damaged runs, never executing their content."""
 
 import math
 from collections.abc import Sequence
@@ -11,20 +11,19 @@ from nerf_lightning.utils.parsing import read_json, read_yaml
 
 FINISHED = ("finished", "collapsed")
 """Status of completed runs."""
-
 FIELD_PAGE = "field.html"
-"""The name of a run's web page in its folder, as the export verb writes it and charts look for it."""
+"""Web page of a run, in its folder."""
 
 
 @dataclass(frozen=True)
 class RunSummary:
-    """What is known of one run."""
+    """Configuration, results and status of a run."""
 
     folder: Path
     config: dict[str, Any]
-    """Resolved; empty if it cannot be read."""
+    """Resolved; empty if unreadable."""
     results: dict[str, Any]
-    """Content of results.json; empty if it is missing or broken."""
+    """Content of results.json; empty if missing or damaged."""
     status: str
     """As in results.json; "unfinished" without one; or "unreadable"."""
     diagnosis: str
@@ -51,10 +50,10 @@ class RunSummary:
 
     @property
     def curve(self) -> list[tuple[float, float, float]]:
-        """(training seconds, step, PSNR), as far as they are finite numbers."""
+        """(training seconds, step, PSNR) of each finite point."""
         points = self.results.get("curve")
-        whole = [p for p in points if isinstance(p, list) and len(p) == 3] if isinstance(points, list) else []
-        return [(p[0], p[1], p[2]) for p in whole if all(map(_finite, p))]
+        triples = [p for p in points if isinstance(p, list) and len(p) == 3] if isinstance(points, list) else []
+        return [(p[0], p[1], p[2]) for p in triples if all(map(_finite, p))]
 
 
 def _finite(value: Any) -> TypeGuard[float]:
@@ -62,10 +61,10 @@ def _finite(value: Any) -> TypeGuard[float]:
 
 
 def read_run(folder: Path) -> RunSummary:
-    """Reads one folder; its status and diagnosis say what is missing or broken."""
+    """Summarizes a run folder; `status` and `diagnosis` say what is missing or damaged."""
     try:
         config = read_yaml(folder / "config.yaml", "a run's configuration in YAML")
-    except InputError:  # told by the verbs that open runs
+    except InputError:  # reported by commands that open the run
         config = {}
     plain = config if isinstance(config, dict) else {}
     if not (folder / "results.json").exists():
@@ -81,10 +80,10 @@ def read_run(folder: Path) -> RunSummary:
 
 
 def find_runs(root: Path) -> list[RunSummary]:
-    """All runs in a folder and below it, in the order of their names.
+    """All runs in a folder and below it, sorted by path.
 
     Raises:
-        InputError: where there is no such folder, or no run in it.
+        InputError: the folder does not exist or holds no run.
     """
     if not root.is_dir():
         raise InputError(root, "", "no such folder", hint="look below outputs/")
@@ -95,7 +94,7 @@ def find_runs(root: Path) -> list[RunSummary]:
 
 
 def flatten_config(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    """A nested configuration with dotted keys; lists stay whole."""
+    """Flattens a nested configuration to dotted keys; lists stay whole."""
     pairs: dict[str, Any] = {}
     for key, value in config.items():
         name = f"{prefix}{key}"
@@ -104,7 +103,7 @@ def flatten_config(config: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def find_varying_options(runs: Sequence[RunSummary]) -> list[str]:
-    """The options in which runs differ, as dotted keys; `recipe` and `method` stand for all that they set."""
+    """Dotted keys of the options in which runs differ; `recipe` and `method` replace the options they set."""
     options = [flatten_config(run.config) for run in runs if run.config]
     common = [key for key in (options[0] if options else {}) if all(key in other for other in options)]
     keys = [key for key in common if any(other[key] != options[0][key] for other in options)]
@@ -112,12 +111,12 @@ def find_varying_options(runs: Sequence[RunSummary]) -> list[str]:
         keys = [key for key in keys if key == "recipe" or not _is_set_by_recipe(key, options)]
     if "method" in keys:
         keys = [key for key in keys if not key.startswith("model.")]
-    kept: dict[tuple[str, str], str] = {}
+    unique: dict[tuple[str, str], str] = {}
     for key in sorted(keys, key=lambda key: key.count(".")):  # dataset.seed only repeats seed
-        kept.setdefault((key.rsplit(".", 1)[-1], str([other[key] for other in options])), key)
-    return [key for key in keys if key in kept.values() and not key.endswith("_target_")]
+        unique.setdefault((key.rsplit(".", 1)[-1], str([other[key] for other in options])), key)
+    return [key for key in keys if key in unique.values() and not key.endswith("_target_")]
 
 
 def _is_set_by_recipe(key: str, options: Sequence[dict[str, Any]]) -> bool:
-    """Whether runs of one recipe have one value at `key`."""
-    return len({(one["recipe"], str(one[key])) for one in options}) == len({one["recipe"] for one in options})
+    """Whether runs of the same recipe share the value at `key`."""
+    return len({(other["recipe"], str(other[key])) for other in options}) == len({other["recipe"] for other in options})

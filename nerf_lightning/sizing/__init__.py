@@ -1,1 +1,1 @@
-"""The smallest model that is good enough: a ladder of sizes, climbed while it pays; full trainings confirm the choice."""
+"""Model size search: a growing training climbs a ladder of sizes; full trainings confirm the choice."""

@@ -1,4 +1,4 @@
-"""What there is to choose from, and decisions on figures alone: when to stop growing, what to train in full, what is enough."""
+"""Ladders of model sizes, and decisions from PSNR and bytes: when to stop growing, and which rungs to train in full."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,30 +12,30 @@ from nerf_lightning.utils.parsing import read_yaml
 
 Options = dict[str, Any]
 GAIN_DIVISOR = 3.0
-"""A rung pays where it gains a `GAIN_DIVISOR`th of what the choice may be below the best, for twice the bytes."""
+"""Growing continues while doubling the bytes gains `within_db / GAIN_DIVISOR`."""
 MAX_RUNGS_WITHOUT_GAIN = 2
-"""Rungs in a row that are not worth their bytes, after which growing stops: one may be chance."""
+"""Consecutive rungs without sufficient gain after which growing stops: one may be chance."""
 FULL_TRAINING_GAIN_DB = 1.0
-"""What a full training is assumed to gain over a rung's shorter one: 2 to 15 were measured, in runs of 10 to 140 s."""
+"""Assumed gain of a full training over a rung's shorter one; 2 to 15 dB were measured in runs of 10 to 140 s."""
 TOLERANCE_DB = 0.5
-"""By which an expectation may be wrong."""
+"""Uncertainty of a predicted PSNR."""
 
 
 @dataclass(frozen=True)
 class Ladder:
-    """What there is to choose from."""
+    """Model and sampler sizes to choose from."""
 
     rungs: list[Options]
-    """Options of the model, smallest first."""
+    """Model options, smallest first."""
     samplers: list[Options]
-    """Options of the sampler, coarsest first; none for images."""
+    """Sampler options, coarsest first; empty for images."""
 
 
 def read_ladder(name: str) -> Ladder:
-    """Reads a ladder: one of conf/ladders by name, or a YAML file of one's own.
+    """Reads a ladder: a name in conf/ladders, or a YAML file.
 
     Raises:
-        InputError: where there is none of that name, or it holds something else.
+        InputError: an unknown name, or an invalid file.
     """
     known = sorted(file.stem for file in (conf_dir() / "ladders").glob("*.yaml"))
     path = conf_dir() / "ladders" / f"{name}.yaml" if name in known else expand_user_path(name)
@@ -43,16 +43,17 @@ def read_ladder(name: str) -> Ladder:
         raise InputError("rightsize", "ladder", name, f"one of {', '.join(known)}, or a YAML file with `rungs`")
     content = read_yaml(path, "a ladder in YAML")
     lists = content if isinstance(content, dict) else {}
-    for key, least in (("rungs", 2), ("samplers", 0)):
-        found = lists.setdefault(key, [])
-        if not isinstance(found, list) or len(found) < least or not all(isinstance(one, dict) for one in found):
-            raise InputError(path, key, repr(found), f"a list of {least} or more mappings of options")
+    for key, min_length in (("rungs", 2), ("samplers", 0)):
+        entries = lists.setdefault(key, [])
+        valid = isinstance(entries, list) and all(isinstance(entry, dict) for entry in entries)
+        if not valid or len(entries) < min_length:
+            raise InputError(path, key, repr(entries), f"a list of {min_length} or more mappings of options")
     return Ladder(lists["rungs"], lists["samplers"])
 
 
 @dataclass(frozen=True)
 class Target:
-    """What is good enough: a figure, or without one a distance from the best that can be reached."""
+    """The required quality: a PSNR, or a distance in dB from the best reachable one."""
 
     psnr: float | None = None
     within_db: float = 0.3
@@ -60,52 +61,52 @@ class Target:
 
 @dataclass(frozen=True)
 class RungResult:
-    """A trained rung: how good it is, and how large."""
+    """Quality and size of a trained rung."""
 
     psnr: float
-    """Held-out dB."""
+    """Held-out PSNR, dB."""
     size: int
-    """Bytes of the compact file."""
+    """Compact file, bytes."""
     parameters: int = 0
     seconds: float = 0.0
-    """Of training."""
+    """Training time."""
 
 
 def is_growth_finished(rungs: Sequence[RungResult], target: Target) -> bool:
-    """Whether there is no point in growing further: the target is near, or the last rungs gained less than they cost."""
+    """Whether to stop growing: the target is near, or the last rungs gained too little for their bytes."""
     if target.psnr is not None:
         return rungs[-1].psnr >= target.psnr - FULL_TRAINING_GAIN_DB
     if len(rungs) <= MAX_RUNGS_WITHOUT_GAIN:
         return False
-    # The best before counts, not the last: two rungs that fall and rise again have gained nothing.
-    base = max(rungs[:-MAX_RUNGS_WITHOUT_GAIN], key=lambda one: one.psnr)
-    each = target.within_db / GAIN_DIVISOR
+    # Compare with the best earlier rung, not the previous one: a dip and recovery gains nothing.
+    base = max(rungs[:-MAX_RUNGS_WITHOUT_GAIN], key=lambda rung: rung.psnr)
+    min_gain = target.within_db / GAIN_DIVISOR
     return all(
-        one.psnr - base.psnr <= each * max(math.log2(one.size / base.size), 1.0)
-        for one in rungs[-MAX_RUNGS_WITHOUT_GAIN:]
+        rung.psnr - base.psnr <= min_gain * max(math.log2(rung.size / base.size), 1.0)
+        for rung in rungs[-MAX_RUNGS_WITHOUT_GAIN:]
     )
 
 
 def find_best(rungs: Sequence[RungResult]) -> int:
-    """The rung with the highest PSNR, the smallest of equals."""
+    """Index of the rung with the highest PSNR; the smallest if tied."""
     return max(range(len(rungs)), key=lambda rung: rungs[rung].psnr)
 
 
 def choose_candidate(rungs: Sequence[RungResult], target: Target) -> int:
-    """The rung to train in full first: the smallest that seems good enough, or the best where none does."""
+    """The rung to train in full first: the smallest that is probably good enough, else the best."""
     best = find_best(rungs)
-    enough = rungs[best].psnr - target.within_db if target.psnr is None else target.psnr - FULL_TRAINING_GAIN_DB
-    return next((rung for rung, one in enumerate(rungs) if one.psnr >= enough), best)
+    threshold = rungs[best].psnr - target.within_db if target.psnr is None else target.psnr - FULL_TRAINING_GAIN_DB
+    return next((rung for rung, result in enumerate(rungs) if result.psnr >= threshold), best)
 
 
 def choose_neighbour(first: int, psnr: float, rungs: Sequence[RungResult], target: Target, last: int) -> int | None:
-    """The rung to train in full beside the first, to be sure of the choice; None where that is sure.
+    """The second rung to train in full, to confirm the choice; None if it is already certain.
 
     Args:
         first: see `choose_candidate`.
-        psnr: dB that it reaches trained in full.
-        rungs: as they were while growing.
-        last: the largest rung of the ladder.
+        psnr: its PSNR after full training, dB.
+        rungs: results while growing.
+        last: index of the largest rung.
     """
     if target.psnr is None:
         best = find_best(rungs)
@@ -118,8 +119,8 @@ def choose_neighbour(first: int, psnr: float, rungs: Sequence[RungResult], targe
 
 
 def choose_final(full: Mapping[int, RungResult], target: Target) -> tuple[int, bool]:
-    """The smallest of the rungs trained in full that is good enough, or the best; and whether it is good enough."""
+    """The smallest fully trained rung that is good enough, else the best; and whether it is good enough."""
     best = max(full, key=lambda rung: full[rung].psnr)
-    enough = full[best].psnr - target.within_db if target.psnr is None else target.psnr
-    found = [rung for rung, one in full.items() if one.psnr >= enough]
-    return (min(found), True) if found else (best, False)
+    threshold = full[best].psnr - target.within_db if target.psnr is None else target.psnr
+    sufficient = [rung for rung, result in full.items() if result.psnr >= threshold]
+    return (min(sufficient), True) if sufficient else (best, False)

@@ -1,4 +1,4 @@
-"""What a search leaves: rightsize.json, chart.png, and best.yaml, an experiment of its own."""
+"""Output of a size search: rightsize.json, chart.png, and best.yaml, an experiment."""
 
 from pathlib import Path
 from typing import Any
@@ -15,13 +15,13 @@ from nerf_lightning.sizing.search import format_figures, set_options
 from nerf_lightning.utils.files import atomic_write, write_json
 
 REPORT_FILE = "rightsize.json"
-"""Written last: with it the search is done."""
+"""Written last: marks a finished search."""
 EXPERIMENT_GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule")
-"""Groups whose values best.yaml holds."""
+"""Config groups stored in best.yaml."""
 
 
 def write_report(result: dict[str, Any], cfg: DictConfig, output: Path) -> None:
-    """Writes all files, from what `search` found and the configuration before options of a rung."""
+    """Writes all files, from the result of `search_sizes` and the base configuration."""
     write_png(output / "chart.png", rasterize_figure(draw_chart(result)))
     with atomic_write(output / "best.yaml") as temporary:
         temporary.write_text(format_experiment(result, cfg), encoding="utf-8")
@@ -29,9 +29,11 @@ def write_report(result: dict[str, Any], cfg: DictConfig, output: Path) -> None:
 
 
 def explain_choice(result: dict[str, Any], output: Path) -> str:
-    """What was chosen, why, and where it is."""
+    """Summarizes the choice, its reason and its files for the terminal."""
     target, rung = result["target"], str(result["rung"])
-    lines = [f"rung {number} reaches {one['psnr']:.2f} dB trained in full" for number, one in result["full"].items()]
+    lines = [
+        f"rung {number} reaches {entry['psnr']:.2f} dB trained in full" for number, entry in result["full"].items()
+    ]
     if target["psnr"] is None:
         goal = f"{target['within_db']:g} dB below the best are allowed"
     else:
@@ -49,7 +51,7 @@ def explain_choice(result: dict[str, Any], output: Path) -> str:
 
 
 def format_experiment(result: dict[str, Any], cfg: DictConfig) -> str:
-    """The choice as an experiment in YAML: all that sets it apart from the defaults."""
+    """Formats the choice as an experiment in YAML, with all options that differ from the defaults."""
     plain = config_to_dict(set_options(set_options(cfg, "model", result["model"]), "sampler", result["sampler"]))
     choices = HydraConfig.get().runtime.choices
     groups = (*EXPERIMENT_GROUPS, "callbacks", "logger", "trainer")
@@ -65,24 +67,24 @@ def format_experiment(result: dict[str, Any], cfg: DictConfig) -> str:
 
 
 def draw_chart(result: dict[str, Any]) -> Figure:
-    """Bytes against PSNR: the climb, the full trainings, the target, and the choice."""
+    """Plots PSNR against bytes: rungs while growing, full trainings, the target and the choice."""
     growing, full, chosen = result["growing"], result["full"].values(), result["full"][str(result["rung"])]
     target = result["target"]
-    enough = max(one["psnr"] for one in full) - target["within_db"] if target["psnr"] is None else target["psnr"]
+    threshold = max(entry["psnr"] for entry in full) - target["within_db"] if target["psnr"] is None else target["psnr"]
     figure = Figure(figsize=(7.2, 4.6), dpi=DPI, layout="constrained")
     axes = figure.subplots()
     kinds = ((growing, "o-", BLUE, "white", "while growing"), (full, "s", ORANGE, ORANGE, "trained in full"))
-    for rungs, style, colour, fill, label in kinds:
-        sizes, figures = [one["size"] / 1000 for one in rungs], [one["psnr"] for one in rungs]
-        axes.plot(sizes, figures, style, color=colour, ms=8, mfc=fill, label=label)
-    for rung, one in enumerate(growing):
-        offset = (0, 8) if rung % 2 else (0, -16)  # neighbours may be as large as each other
-        place = one["size"] / 1000, one["psnr"]
-        axes.annotate(str(rung), place, offset, textcoords="offset points", ha="center")
-    place = chosen["size"] / 1000, chosen["psnr"]
-    axes.plot(*place, "o", ms=19, mfc="none", mec=VERMILLION, mew=2, label=f"chosen: rung {result['rung']}")
-    axes.axhline(enough, color=GREY, lw=1, ls="--", label=f"enough: {enough:.2f} dB")
-    axes.set(xscale="log", xlabel="compact file, kB", ylabel="held-out PSNR, dB", title="What each size is worth")
+    for rungs, style, color, fill, label in kinds:
+        sizes, figures = [entry["size"] / 1000 for entry in rungs], [entry["psnr"] for entry in rungs]
+        axes.plot(sizes, figures, style, color=color, ms=8, mfc=fill, label=label)
+    for rung, entry in enumerate(growing):
+        offset = (0, 8) if rung % 2 else (0, -16)  # neighbours may have equal sizes
+        point = entry["size"] / 1000, entry["psnr"]
+        axes.annotate(str(rung), point, offset, textcoords="offset points", ha="center")
+    point = chosen["size"] / 1000, chosen["psnr"]
+    axes.plot(*point, "o", ms=19, mfc="none", mec=VERMILLION, mew=2, label=f"chosen: rung {result['rung']}")
+    axes.axhline(threshold, color=GREY, lw=1, ls="--", label=f"enough: {threshold:.2f} dB")
+    axes.set(xscale="log", xlabel="compact file, kB", ylabel="held-out PSNR, dB", title="Quality by size")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.margins(0.08, 0.12)
     axes.grid(alpha=0.3)

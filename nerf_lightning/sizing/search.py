@@ -1,4 +1,4 @@
-"""The search: one training climbs the ladder, growing; the rung that seems enough and a neighbour are trained in full."""
+"""Size search: one growing training climbs the ladder; the candidate rung and a neighbour are trained in full."""
 
 import copy
 import inspect
@@ -51,39 +51,38 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.text import subsample
 
 LADDER_BUDGET_FRACTION = 0.75
-"""Share of a budget in steps that climbing the whole ladder takes."""
+"""Fraction of a step budget for climbing the whole ladder."""
 RUNG_STEPS = 300
-"""Steps on each rung where the budget is in seconds: what is chosen must not depend on what else the machine does."""
+"""Steps per rung for budgets in seconds: the choice must not depend on background load."""
 NUM_VIEWS = 8
-"""Held-out views that measure a rung, and training views that decide what its file must hold."""
+"""Held-out views that measure a rung, and training views that prune its file."""
 MAX_SAMPLER_LOSS_DB = 0.05
-"""By which a sampler may be worse than the best, on the same field."""
+"""PSNR that a coarser sampler may lose on the same field."""
 WARMUP_GRID_UPDATES = 4
-"""After which a sampler knows a field."""
+"""Updates after which an occupancy grid has converged on a trained field."""
 MAX_COMPACT_LOSS_DB = 0.1
 PLAN_FILE = "search.json"
-"""File that says what is searched for."""
+"""The search's target, ladder and configuration."""
 
 
 def search_sizes(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) -> dict[str, Any]:
-    """Finds the smallest rung that is good enough, and leaves it trained in full in `rung_N`, and compact.npz.
+    """Finds the smallest rung that is good enough; writes its run to `rung_N`, and compact.npz.
 
-    A search that was interrupted climbs again, to where it did before; what was trained in full is kept.
+    An interrupted search climbs again, with the same results; full trainings are kept.
 
     Returns:
-        The content of rightsize.json: `target`; `growing`, the rungs as they were while growing; `full`, those trained with the
-        whole budget, by number; `rung`, the chosen one, with its options of `model` and `sampler`, and the `psnr` and
-        `artifact_bytes` of its compact file; whether it `reached` the target; the `device`; and the `search_seconds` of
-        training in all.
+        The content of rightsize.json: `target`; `growing`, the rungs while growing; `full`, those trained with the whole
+        budget, by index; `rung`, the chosen one, with its `model` and `sampler` options, and `psnr` and `artifact_bytes` of
+        its compact file; whether it `reached` the target; `device`; and `search_seconds`, the total training time.
 
     Raises:
-        InputError: where the device, the data or an option of the ladder is no good; or the folder holds something else.
+        InputError: invalid device, data or ladder options; or the folder holds something else.
     """
     device, data = prepare_search(cfg, ladder, output)
     start_or_resume(output, cfg, target, ladder)
     rungs, systems = climb_ladder(cfg, data, ladder.rungs, target, output)
     first = choose_candidate(rungs, target)
-    print(f"climbed to rung {len(rungs) - 1}; rung {first} seems enough", flush=True)
+    print(f"climbed to rung {len(rungs) - 1}; training rung {first} in full", flush=True)
     sampler = find_sampler(set_options(cfg, "model", ladder.rungs[first]), data, systems[first], ladder.samplers)
     full = {first: train_full_run(cfg, ladder.rungs[first], sampler, data, output / f"rung_{first}")}
     second = choose_neighbour(first, full[first].psnr, rungs, target, len(ladder.rungs) - 1)
@@ -103,14 +102,14 @@ def search_sizes(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) 
         "sampler": sampler,
         "psnr": compact.psnr,
         "artifact_bytes": len(compact.content),
-        "search_seconds": sum(one.seconds for one in (*rungs, *full.values())),
-        "growing": [asdict(one) for one in rungs],
-        "full": {str(rung): asdict(one) for rung, one in full.items()},
+        "search_seconds": sum(result.seconds for result in (*rungs, *full.values())),
+        "growing": [asdict(result) for result in rungs],
+        "full": {str(rung): asdict(result) for rung, result in full.items()},
     }
 
 
 def prepare_search(cfg: DictConfig, ladder: Ladder, output: Path) -> tuple[torch.device, DataModule]:
-    """The device and the data, after all options were checked."""
+    """Checks all options; returns the device and the data."""
     device = build.resolve_run_device(cfg)
     silence_lightning()
     prepare_process(cfg)
@@ -122,10 +121,10 @@ def prepare_search(cfg: DictConfig, ladder: Ladder, output: Path) -> tuple[torch
 
 
 def start_or_resume(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None:
-    """Writes down what is searched for, unless the same search began here before.
+    """Writes the search plan, unless the folder holds the same one.
 
     Raises:
-        InputError: where the folder holds anything else.
+        InputError: the folder holds anything else.
     """
     plan = {"target": asdict(target), "ladder": asdict(ladder), "config": config_to_dict(cfg)}
     if is_empty(output):
@@ -136,7 +135,7 @@ def start_or_resume(output: Path, cfg: DictConfig, target: Target, ladder: Ladde
 
 
 def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
-    """A copy of a configuration with other options in a group, "" for the top; unknown ones raise when the group is built."""
+    """A copy of a configuration with options of a group replaced ("" for the top level), not yet validated."""
     changed = copy.deepcopy(cfg)
     for key, value in options.items():
         OmegaConf.update(changed, f"{group}.{key}".lstrip("."), value, force_add=True)
@@ -144,20 +143,20 @@ def set_options(cfg: DictConfig, group: str, options: Options) -> DictConfig:
 
 
 def configure_rung(cfg: DictConfig, ladder: Sequence[Options], rung: int) -> DictConfig:
-    """The configuration of a rung's training: in steps, however the budget was given, without images, files and curves."""
+    """The configuration of a rung's training: a step budget, no logger, and no callbacks but recovery."""
     steps = build.get_budget_options(cfg).get("steps")
-    wanted = RUNG_STEPS if steps is None else max(1, round(steps * LADDER_BUDGET_FRACTION / len(ladder)))
-    changed = set_options(cfg, "budget", {"steps": wanted, "seconds": None, "patience": None})
+    rung_steps = RUNG_STEPS if steps is None else max(1, round(steps * LADDER_BUDGET_FRACTION / len(ladder)))
+    changed = set_options(cfg, "budget", {"steps": rung_steps, "seconds": None, "patience": None})
     OmegaConf.update(changed, "callbacks", {"recovery": (cfg.callbacks or {}).get("recovery")}, merge=False)
     OmegaConf.update(changed, "logger", None)
     return set_options(changed, "model", ladder[rung])
 
 
 def train_rung(cfg: DictConfig, data: DataModule, folder: Path, smaller: System | None = None) -> tuple[System, float]:
-    """Trains a system, from what a smaller one has learned if there is room for it.
+    """Trains a system, warm-started from a smaller one if that fits.
 
     Returns:
-        The system, on the device that trained it, and the seconds it took.
+        The system, on its training device, and the training time in seconds.
     """
     prepare_process(cfg)
     silence_lightning()
@@ -165,7 +164,7 @@ def train_rung(cfg: DictConfig, data: DataModule, folder: Path, smaller: System 
     device = build.resolve_run_device(cfg)
     system = build.build_system(cfg, build.get_metadata(data), device)
     if smaller is not None and is_at_least_as_wide(system.field, smaller.field):
-        system.warm_start_from(smaller.cpu())  # where a new system is
+        system.warm_start_from(smaller.cpu())  # a new system is on the CPU
         smaller.to(device)
     trainer = build.build_trainer(cfg, folder, device)
     warm_up(system, data, device)
@@ -176,61 +175,60 @@ def train_rung(cfg: DictConfig, data: DataModule, folder: Path, smaller: System 
 def climb_ladder(
     cfg: DictConfig, data: DataModule, ladder: Sequence[Options], target: Target, folder: Path
 ) -> tuple[list[RungResult], list[System]]:
-    """Trains the smallest rung, then continues with each larger one, for as many steps each, while that pays.
+    """Trains rungs in ascending order, each warm-started from the last, until `is_growth_finished`.
 
-    A rung that is smaller than the last in something starts anew.
+    A rung that is smaller than the last in any option starts from scratch.
 
     Returns:
-        The rungs, and their systems.
+        The results, and their systems.
     """
     rungs: list[RungResult] = []
     systems: list[System] = []
-    before = Options()
+    previous = Options()
     for number, options in enumerate(ladder):
         part = configure_rung(cfg, ladder, number)
         model = build.resolve_config(part.model)
         system, seconds = train_rung(
-            part, data, folder, systems[-1] if systems and is_larger_model(model, before) else None
+            part, data, folder, systems[-1] if systems and is_larger_model(model, previous) else None
         )
         parameters = sum(p.numel() for p in system.parameters() if p.requires_grad)
         rung = RungResult(measure_psnr(system, data), estimate_compact_bytes(part, system, data), parameters, seconds)
         print(f"rung {number}: {format_options(options)}: {format_figures(rung.psnr, rung.size)}", flush=True)
-        rungs, systems, before = [*rungs, rung], [*systems, system], model
+        rungs, systems, previous = [*rungs, rung], [*systems, system], model
         if is_growth_finished(rungs, target):
             break
     return rungs, systems
 
 
-def is_larger_model(model: Options, before: Options) -> bool:
-    """Whether no number among a model's options is less than before: only then what that learned fits in."""
-    both = ((value, model.get(key)) for key, value in before.items())
+def is_larger_model(model: Options, previous: Options) -> bool:
+    """Whether no numeric option decreases, so that the previous weights fit."""
+    both = ((value, model.get(key)) for key, value in previous.items())
     return all(b >= a for a, b in both if isinstance(a, int | float) and isinstance(b, int | float))
 
 
 def measure_psnr(system: System, data: DataModule) -> float:
-    """Mean dB over a few held-out views.
+    """Mean PSNR over `NUM_VIEWS` held-out views, dB.
 
     Raises:
-        InputError: where what it shows is not finite.
+        InputError: rendered images are not finite.
     """
-    found = measure_held_out_psnr(system, data, subsample(data.num_held_out_views, NUM_VIEWS))
-    if not math.isfinite(found):
+    psnr = measure_held_out_psnr(system, data, subsample(data.num_held_out_views, NUM_VIEWS))
+    if not math.isfinite(psnr):
         raise InputError("rightsize", "", "rendered images are not finite", hint="lower optimizer.lr")
-    return found
+    return psnr
 
 
 def estimate_compact_bytes(cfg: DictConfig, system: Any, data: DataModule) -> int:
-    """Approximate size of a system's compact file: only a few views decide what it must hold."""
+    """Approximate size of a system's compact file, pruned by `NUM_VIEWS` views."""
     seen = find_seen_cells(system, subsample_cameras(data, NUM_VIEWS)) if data.is_posed else None
     return len(encode(prune_to_cells(system, seen), "byte", config_to_dict(cfg), scene_to_dict(data)))
 
 
 def find_sampler(cfg: DictConfig, data: DataModule, system: System, samplers: Sequence[Options]) -> Options:
-    """The coarsest of some samplers with which a trained field renders as well as with the best; options that its kind of
-    sampler does not have are left out."""
+    """The coarsest sampler options that render a trained field as well as the best; skips options of other samplers."""
     known = inspect.signature(build.resolve_target(cfg, "sampler")).parameters if samplers else {}
     scores: list[tuple[Options, float]] = []
-    for options in (one for one in samplers if one.keys() <= known.keys()):
+    for options in (entry for entry in samplers if entry.keys() <= known.keys()):
         probe: Any = build.build_system(set_options(cfg, "sampler", options), build.get_metadata(data), system.device)
         probe.field = system.field
         probe.to(system.device)
@@ -240,12 +238,12 @@ def find_sampler(cfg: DictConfig, data: DataModule, system: System, samplers: Se
             generator = step_generator(probe.seed, Stream.ANALYSIS, number, probe.device)
             probe.sampler.update(step, probe.field.density, generator)
         scores.append((options, measure_psnr(probe.eval(), data)))
-    enough = max((psnr for _, psnr in scores), default=0.0) - MAX_SAMPLER_LOSS_DB
-    return next((options for options, psnr in scores if psnr >= enough), {})
+    threshold = max((psnr for _, psnr in scores), default=0.0) - MAX_SAMPLER_LOSS_DB
+    return next((options for options, psnr in scores if psnr >= threshold), {})
 
 
 def train_full_run(cfg: DictConfig, model: Options, sampler: Options, data: DataModule, folder: Path) -> RungResult:
-    """Trains a run of its own, with the whole budget. One that is finished is kept, one that was interrupted continues."""
+    """Trains a rung with the whole budget; keeps a finished run, continues an interrupted one."""
     whole = set_options(set_options(cfg, "model", model), "sampler", sampler)
     print(f"{folder}: {format_options(model)}, in full", flush=True)
     done, checkpoint = find_progress(read_run(folder), whole)
@@ -261,5 +259,4 @@ def format_options(options: Options) -> str:
 
 
 def format_figures(psnr: float, size: int) -> str:
-    """dB and bytes in words."""
     return f"{psnr:.2f} dB in {size / 1000:,.1f} kB"

@@ -1,1 +1,1 @@
-"""Methods tried where they are known to fail: small scenes of known truth, conditions, the suite, and what it found."""
+"""Stability suite: methods trained on small synthetic scenes under adverse conditions."""

@@ -1,4 +1,4 @@
-"""Conditions under which methods are known to fail, and the methods: conf/stability.yaml."""
+"""Adverse training conditions and methods of the stability suite, read from conf/stability.yaml."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -25,26 +25,26 @@ from nerf_lightning.synthetic.objects import (
 from nerf_lightning.synthetic.rooms import ROOMS, make_room_scene
 
 UPSCALE_FACTOR = 2
-"""Images have this many times the pixels trained on along each side, so that a 2D field is judged between them too."""
+"""Images have this many times the training pixels per side, so that 2D fields are also tested between them."""
 
 
 @cache
 def make_subject(seed: int) -> Scene:
-    """The same for every seed; nobody changes it in place."""
+    """The pile, shared by all seeds; never modified in place."""
     return make_object_scene(PILE)
 
 
 def make_closeup(seed: int) -> Scene:
-    """The pile, with held-out views from nearer than the training views."""
+    """The pile, with held-out views closer than the training views."""
     scene = make_subject(0)
     cameras = make_hemisphere_cameras(len(scene.val), scene.val.cameras.width, phase=0.7, distance=2.4)
     return replace(scene, val=Views.from_images(render_photos(PILE, cameras, scene.background), cameras))
 
 
 def make_waves(width: int = 48, height: int = 48) -> Picture:
-    """Waves in three colours that grow shorter from left to right, down to six pixels of the image that is trained on.
+    """Colour waves whose wavelength decreases from left to right, to six pixels of the training image.
 
-    That one is `width` by `height`; this one has `UPSCALE_FACTOR` times as many pixels along each side.
+    That image has `width` by `height` pixels; the returned one `UPSCALE_FACTOR` times as many per side.
     """
     across, down = ((np.arange(UPSCALE_FACTOR * side) + 0.5) / (UPSCALE_FACTOR * side) for side in (width, height))
     phase = np.pi * across**2 * width / 6
@@ -54,7 +54,6 @@ def make_waves(width: int = 48, height: int = 48) -> Picture:
 
 
 def make_uniform_image() -> Picture:
-    """An image of one colour."""
     return Picture("plain", BUILT_IN, torch.tensor([200, 120, 40], dtype=torch.uint8).expand(96, 96, 3).contiguous())
 
 
@@ -76,7 +75,7 @@ IMAGE_SCENES = ("waves", "wide waves", "one colour")
 
 @dataclass(frozen=True)
 class Condition:
-    """One way to make training hard; conf/stability.yaml explains the fields."""
+    """An adverse training condition; conf/stability.yaml explains the fields."""
 
     name: str
     scene: str = "pile"
@@ -91,23 +90,22 @@ class Condition:
 
     @property
     def is_2d(self) -> bool:
-        """Whether it is 2D."""
         return self.scene in IMAGE_SCENES
 
     @property
     def check(self) -> str:
-        """What must hold, in words."""
+        """The pass criterion in words."""
         if self.is_unsolvable:
             return "refused, or an alarm"
         return "no collapse" if self.max_loss_db is None else f"within {self.max_loss_db:g} dB of clean"
 
     def make(self, seed: int) -> Scene | Picture:
-        """The scene or image."""
-        made = SCENES[self.scene](seed)
+        """The scene or image of a seed."""
+        scene = SCENES[self.scene](seed)
         if self.corrupt:
             name, *arguments = self.corrupt
-            made = getattr(corruptions, name)(made, seed, *arguments)
-        return made
+            scene = getattr(corruptions, name)(scene, seed, *arguments)
+        return scene
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,7 @@ class Method:
     recovery_twin: str | None = None
 
     def get_options_for(self, condition: Condition) -> list[str] | None:
-        """Overrides; None if the condition does not apply."""
+        """Config overrides; None if the condition does not apply."""
         if condition.by_kind and self.kind not in condition.by_kind:
             return None
         return [*self.options, *condition.options, *condition.by_kind.get(self.kind, [])]

@@ -1,4 +1,4 @@
-"""One trial of the suite: a condition, a method and a seed, trained as a user would."""
+"""Trials of the suite: one training per condition, method and seed."""
 
 from collections import deque
 from collections.abc import Generator, Sequence
@@ -17,24 +17,24 @@ from nerf_lightning.utils.parsing import read_json
 
 @dataclass(frozen=True)
 class TrialResult:
-    """The result of a trial, as in stability.json."""
+    """Result of a trial, as in stability.json."""
 
     condition: str
     method: str
     seed: int
     psnr: float | None
-    """dB on held-out views; of an image, at `UPSCALE_FACTOR` times the pixels it was trained on along each side."""
+    """Held-out PSNR, dB; for images at `UPSCALE_FACTOR` times the training pixels per side."""
     status: str
     """finished, collapsed, refused (before training) or failed."""
     diagnosis: str
     recoveries: int
     alarm: str
-    """What the run warned of, about the data or the result."""
+    """Warnings of the run about the data or the result."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What to train."""
+    """A training of the suite."""
 
     condition: str
     method: str
@@ -43,7 +43,7 @@ class Trial:
 
 
 def list_trials(conditions: Sequence[str], methods: Sequence[str], seeds: int, steps: int) -> list[Trial]:
-    """The trials of a suite: one seed of hopeless conditions, and no control method under a control condition."""
+    """Trials of a suite: one seed of unsolvable conditions, and no control method under a control condition."""
     return [
         Trial(condition.name, name, seed, steps)
         for condition in CONDITIONS.values()
@@ -56,37 +56,36 @@ def list_trials(conditions: Sequence[str], methods: Sequence[str], seeds: int, s
 
 
 def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Generator[TrialResult, None, None]:
-    """Runs trials in processes of one thread each, which end with this one; yields their outcomes in order.
+    """Runs trials in single-threaded worker processes; yields their results in order.
 
     Raises:
-        InputError: where the system ends a process.
+        InputError: the system killed a worker.
     """
     from joblib.externals.loky import ProcessPoolExecutor
     from joblib.externals.loky.process_executor import TerminatedWorkerError
 
-    # Should this process be killed, they end when they have been idle for a minute.
+    # If this process is killed, idle workers end after a minute.
     pool = ProcessPoolExecutor(workers, timeout=60, env={"OMP_NUM_THREADS": "1"})
     try:
-        # A few at a time, and not pool.map: where trials wait in line or are cancelled, loky's shutdown fails (joblib 1.6).
+        # Submits a few at a time instead of pool.map: loky's shutdown fails with queued or cancelled trials (joblib 1.6).
         rest = iter(trials)
         running = deque(pool.submit(run_trial, trial, root) for trial in islice(rest, 2 * workers))
         while running:
             yield running.popleft().result()
             running.extend(pool.submit(run_trial, trial, root) for trial in islice(rest, 1))
     except TerminatedWorkerError as error:
-        found = f"the system ended one of {workers} processes, as when memory is short"
-        raise InputError("stability", "workers", found, hint="give fewer; the same command continues") from error
+        problem = f"the system ended one of {workers} processes, as when memory is short"
+        raise InputError("stability", "workers", problem, hint="give fewer; the same command continues") from error
     finally:
         pool.shutdown(kill_workers=True)
 
 
 def get_trial_folder(root: Path, condition: str, method: str, seed: int) -> Path:
-    """Where a trial's run is left."""
     return root / "trials" / slugify(condition) / f"{slugify(method)}_seed{seed}"
 
 
 def run_trial(trial: Trial, root: Path) -> TrialResult:
-    """Trains, unless the outcome of a trial with the same options is there."""
+    """Trains a trial, unless the folder holds its result for the same options."""
     condition, method = CONDITIONS[trial.condition], METHODS[trial.method]
     folder = get_trial_folder(root, trial.condition, trial.method, trial.seed)
     identity = {"steps": trial.steps, "options": method.get_options_for(condition), "condition": asdict(condition)}
@@ -95,20 +94,20 @@ def run_trial(trial: Trial, root: Path) -> TrialResult:
         if content["identity"] == identity:
             return TrialResult(**content["outcome"])
     except (InputError, KeyError, TypeError):
-        pass  # missing or damaged: trained again
+        pass  # missing or damaged: train again
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "log.txt").open("w", encoding="utf-8") as log, redirect_stdout(log), redirect_stderr(log):
-        found = train_trial(trial, folder)
-    result = TrialResult(trial.condition, trial.method, trial.seed, **found)
+        outcome = train_trial(trial, folder)
+    result = TrialResult(trial.condition, trial.method, trial.seed, **outcome)
     write_json(folder / "trial.json", {"identity": identity, "outcome": asdict(result)})
     return result
 
 
 def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
-    """Trains and measures; returns the fields of the outcome that this decides.
+    """Trains and measures; returns the fields of `TrialResult` that depend on it.
 
     Raises:
-        OSError, NoRoom: for a full disk, which says nothing about the method.
+        OSError, DiskFullError: the disk is full, which says nothing about the method.
     """
     from nerf_lightning.config.compose import compose_config
     from nerf_lightning.config.quoting import make_override
@@ -117,47 +116,47 @@ def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
     from nerf_lightning.training.train import train
 
     condition, method = CONDITIONS[trial.condition], METHODS[trial.method]
-    made: Any = condition.make(trial.seed)
+    scene: Any = condition.make(trial.seed)
     if condition.is_2d:
         path = folder / "image.png"
-        write_png(path, made.image.numpy())
-        given = [
+        write_png(path, scene.image.numpy())
+        overrides = [
             "callbacks.pictures=null",
-            f"dataset.max_side={max(made.size) // UPSCALE_FACTOR}",
+            f"dataset.max_side={max(scene.size) // UPSCALE_FACTOR}",
             f"render.scale={UPSCALE_FACTOR}",
         ]
     else:
         path = folder / "scene.npz"
-        save_npz(made, path)
-        given = ["dataset=photos", "callbacks.orbit=null"]
-    given += [
+        save_npz(scene, path)
+        overrides = ["dataset=photos", "callbacks.orbit=null"]
+    overrides += [
         *(method.get_options_for(condition) or []),
         make_override("dataset.path", path),
         f"seed={trial.seed}",
         f"budget.steps={trial.steps}",
     ]
-    given += ["threads=1", "device=cpu"]  # trials are small, and run side by side
-    given += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.validation=null", "callbacks.checkpoints=null"]
-    found: dict[str, Any] = {"psnr": None, "status": "failed", "diagnosis": "", "recoveries": 0, "alarm": ""}
+    overrides += ["threads=1", "device=cpu"]  # trials are small and run in parallel
+    overrides += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.validation=null", "callbacks.checkpoints=null"]
+    outcome: dict[str, Any] = {"psnr": None, "status": "failed", "diagnosis": "", "recoveries": 0, "alarm": ""}
     try:
-        cfg = compose_config(given, folder)
+        cfg = compose_config(overrides, folder)
         cfg.optimizer.lr *= condition.lr_scale
         train(cfg)
         results = read_json(folder / "results.json", "figures")
-        found |= {key: results[key] for key in ("psnr", "status", "diagnosis")}
+        outcome |= {key: results[key] for key in ("psnr", "status", "diagnosis")}
         if method.is_2d:
-            between = read_json(folder / "enlarged.json", "figures")["field"]
-            found["psnr"] = found["psnr"] if between is None else between  # None where every byte is right
-        found["recoveries"] = len(results["recoveries"])
-        alarms = [*results["warnings"], found["diagnosis"] if found["status"] == "finished" else ""]
-        found["alarm"] = "; ".join(filter(None, alarms))
+            upscaled_psnr = read_json(folder / "enlarged.json", "figures")["field"]
+            outcome["psnr"] = outcome["psnr"] if upscaled_psnr is None else upscaled_psnr  # None if all bytes are exact
+        outcome["recoveries"] = len(results["recoveries"])
+        alarms = [*results["warnings"], outcome["diagnosis"] if outcome["status"] == "finished" else ""]
+        outcome["alarm"] = "; ".join(filter(None, alarms))
     except DiskFullError:
         raise
     except InputError as error:
-        found |= {"status": "refused", "diagnosis": str(error).replace(str(path), condition.name)}
-    except Exception as error:  # noqa: BLE001  (failures are what the suite looks for)
+        outcome |= {"status": "refused", "diagnosis": str(error).replace(str(path), condition.name)}
+    except Exception as error:  # noqa: BLE001  (failures are results of the suite)
         if is_disk_full(error):
             raise
-        found["diagnosis"] = " ".join(f"{type(error).__name__}: {error}".split())
+        outcome["diagnosis"] = " ".join(f"{type(error).__name__}: {error}".split())
     path.unlink(missing_ok=True)
-    return found
+    return outcome

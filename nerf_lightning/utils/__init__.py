@@ -1,1 +1,1 @@
-"""Helpers that know nothing of fields: files, seeds, the machine, its devices."""
+"""Helpers independent of radiance fields: files, seeds, machine, devices, signals."""

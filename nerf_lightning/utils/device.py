@@ -1,4 +1,4 @@
-"""Which device to use, and waiting for it."""
+"""Device selection and synchronization."""
 
 import torch
 
@@ -8,32 +8,29 @@ CPU = torch.device("cpu")
 
 
 def available_devices() -> list[str]:
-    """The kinds of devices available, best first, then any that is registered with torch. The CPU is always there."""
-    found = [name for name, kind in (("cuda", torch.cuda), ("mps", torch.backends.mps)) if kind.is_available()]
-    own = torch._C._get_privateuse1_backend_name()
-    module = getattr(torch, own, None)
-    registered = own != "privateuseone" and module is not None and module.is_available()
-    return [*found, "cpu", *([own] if registered else [])]
+    """Available device types, best first: cuda, mps, cpu, then a backend registered with torch."""
+    names = [name for name, kind in (("cuda", torch.cuda), ("mps", torch.backends.mps)) if kind.is_available()]
+    backend = torch._C._get_privateuse1_backend_name()
+    module = getattr(torch, backend, None)
+    registered = backend != "privateuseone" and module is not None and module.is_available()
+    return [*names, "cpu", *([backend] if registered else [])]
 
 
 def resolve_device(name: str) -> torch.device:
-    """The device with a name.
-
-    Args:
-        name: "auto" for the best one available, or cpu, cuda, mps, or the name of a backend registered with torch.
+    """The torch device of a name: auto (the best available), cpu, cuda, mps, or a backend registered with torch.
 
     Raises:
-        InputError: for another name, or a device that is not available.
+        InputError: for an unknown name, or a device that is not available.
     """
-    found = available_devices()
+    available = available_devices()
     if name == "auto":
-        return torch.device(found[0])
-    if name in found:
+        return torch.device(available[0])
+    if name in available:
         return torch.device(name)
-    raise InputError("config", "device", repr(name), f"auto, or what is there: {', '.join(found)}")
+    raise InputError("config", "device", repr(name), f"auto, or an available device: {', '.join(available)}")
 
 
 def synchronize(device: torch.device) -> None:
-    """Waits until a device has finished its queue, so that the clock is right; a CPU has none."""
+    """Waits for an accelerator's queue to finish, so that timings are right."""
     if device.type != "cpu":
         torch.get_device_module(device).synchronize()

@@ -1,4 +1,4 @@
-"""Paths as users write them, and files that are written whole or not at all."""
+"""User paths, and atomic writes of files and folders."""
 
 import errno
 import json
@@ -14,7 +14,7 @@ from typing import Any
 from nerf_lightning.errors import DiskFullError, InputError
 
 DISK_FULL_ERRNOS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-"""A full disk, a quota, a limit on the size of files."""
+"""Full disk, quota, file size limit."""
 
 
 @contextmanager
@@ -22,9 +22,9 @@ def atomic_write(path: Path) -> Iterator[Path]:
     """Yields a temporary file in the same folder, with the same suffix; renames it to `path` if the block succeeds.
 
     Raises:
-        NoRoom: the disk is full; what was at `path` stays.
-        InputError: a folder is there.
-        OSError: the folder cannot be written.
+        DiskFullError: the disk is full; the file at `path` stays.
+        InputError: `path` is a folder.
+        OSError: the folder is not writable.
     """
     if path.is_dir():
         raise InputError(path, "", "a folder", "a file to write", "give another name")
@@ -37,7 +37,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_write_folder(path: Path) -> Iterator[Path]:
-    """As `atomic_write`, for a folder, which replaces one that is there."""
+    """As `atomic_write`, for a folder; replaces an existing one."""
     with _temporary_sibling(path, Path.mkdir) as temporary:
         yield temporary
         shutil.rmtree(path, ignore_errors=True)
@@ -61,7 +61,7 @@ def _temporary_sibling(path: Path, create: Callable[[Path], None]) -> Iterator[P
 
 
 def link_file(source: Path, target: Path) -> None:
-    """Gives a file a second name, which keeps its content when `source` is replaced; a copy where there are no links."""
+    """Hard-links a file, so that `target` keeps its content when `source` is replaced; copies where links are unsupported."""
     with atomic_write(target) as temporary:
         temporary.unlink()
         try:
@@ -71,7 +71,7 @@ def link_file(source: Path, target: Path) -> None:
 
 
 def remove_path(path: Path) -> None:
-    """Removes a file, or a folder with its content, if it is there."""
+    """Removes a file or a folder with its content, if it exists."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
@@ -79,7 +79,7 @@ def remove_path(path: Path) -> None:
 
 
 def is_disk_full(error: BaseException | None) -> bool:
-    """Whether an error, or one that led to it, says that a disk is full."""
+    """Whether an error or one of its causes is a full disk."""
     while error is not None:
         if isinstance(error, DiskFullError) or (isinstance(error, OSError) and error.errno in DISK_FULL_ERRNOS):
             return True
@@ -88,60 +88,60 @@ def is_disk_full(error: BaseException | None) -> bool:
 
 
 def disk_full_error(where: object) -> DiskFullError:
-    """The error for a full disk."""
-    return DiskFullError(where, "", "no space left on the device", hint="free some and continue: nothing was lost")
+    return DiskFullError(
+        where, "", "no space left on the device", hint="free some and continue: existing files are unchanged"
+    )
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes text, atomically."""
+    """Writes UTF-8 text atomically."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: Path, content: object) -> None:
-    """Writes strict JSON (no NaN), atomically."""
+    """Writes strict JSON (no NaN) atomically."""
     write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")
 
 
 def nan_to_none(value: Any) -> Any:
-    """Plain values with null for NaN and infinity, which JSON does not have."""
+    """Replaces NaN and infinity, which JSON lacks, by None in nested plain values."""
     if isinstance(value, dict):
-        return {key: nan_to_none(one) for key, one in value.items()}
+        return {key: nan_to_none(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [nan_to_none(one) for one in value]
+        return [nan_to_none(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def expand_user_path(text: str | os.PathLike[str]) -> Path:
-    """A path as a user writes it, with ~ expanded."""
     return Path(os.path.expanduser(text))
 
 
 def check_output_path(text: str | os.PathLike[str]) -> Path:
-    """As `expand_user_path`, for something to write, checked before any work is done.
+    """Expands an output path and checks that it is writable, before any work is done.
 
     Raises:
-        InputError: where no file can be written.
+        InputError: the folder is not writable.
     """
     path = expand_user_path(text)
     folder = path.absolute() if path.is_dir() else next(p for p in path.absolute().parents if os.path.lexists(p))
     if not folder.is_dir() or not os.access(folder, os.W_OK | os.X_OK):
-        found = f"{folder} {'may not be written' if folder.is_dir() else 'is a file'}"
-        raise InputError(path, "", found, hint="give another folder")
+        problem = f"{folder} {'may not be written' if folder.is_dir() else 'is a file'}"
+        raise InputError(path, "", problem, hint="give another folder")
     return path
 
 
 def remove_empty_folders(folder: Path) -> None:
-    """Removes a folder and, below the current one, those above it, as far as they are empty."""
-    folder, here = folder.resolve(), Path.cwd()
+    """Removes a folder and its parents below the current folder, as far as they are empty."""
+    folder, current = folder.resolve(), Path.cwd()
     with suppress(OSError):
-        while folder != here:
+        while folder != current:
             folder.rmdir()
-            folder = folder.parent if here in folder.parents else here
+            folder = folder.parent if current in folder.parents else current
 
 
 def cache_folder() -> Path:
-    """Where this package keeps what it can make again: NERF_LIGHTNING_CACHE, or `nerf_lightning` in the user's cache."""
-    if own := os.environ.get("NERF_LIGHTNING_CACHE"):
-        return Path(own)
+    """The cache folder: NERF_LIGHTNING_CACHE, or `nerf_lightning` in the user's cache."""
+    if folder := os.environ.get("NERF_LIGHTNING_CACHE"):
+        return Path(folder)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "nerf_lightning"

@@ -1,4 +1,4 @@
-"""Web pages of one file each: templates filled by Jinja2, a content policy that allows a page's own style and script alone."""
+"""Single-file web pages: Jinja2 templates with a content security policy that allows only their own style and script."""
 
 import base64
 import hashlib
@@ -13,15 +13,15 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 TEMPLATE_FOLDER = Path(__file__).parent
-"""Of page.html, which templates extend, and of page.css, which gives all pages one look."""
+"""Holds page.html, the base template, and page.css, the shared style."""
 
 
 def render_page(template: Path, styles: Sequence[Path] = (), scripts: Sequence[Path] = (), **values: object) -> str:
-    """Fills a template that extends page.html. Values are escaped, except those that are Markup.
+    """Renders a template that extends page.html; escapes all values except Markup.
 
     Args:
         template: an HTML file.
-        styles, scripts: put into the page, after page.css.
+        styles, scripts: inlined after page.css.
         values: of the template, with `title`.
     """
     loader = FileSystemLoader([template.parent, TEMPLATE_FOLDER])
@@ -37,16 +37,16 @@ def render_page(template: Path, styles: Sequence[Path] = (), scripts: Sequence[P
 
 
 def read_minified(file: Path) -> str:
-    """A script, shader or style without the comments and indents that only its readers need."""
+    """The text of a script, shader or style without comments and indentation."""
     lines = (re.sub(r"(^|\s\s+)//.*$", "", line).strip() for line in file.read_text(encoding="utf-8").splitlines())
     return "\n".join(filter(None, lines))
 
 
 def json_for_script(content: object) -> Markup:
-    """Strict JSON in which nothing can end the script element that holds it."""
+    """Strict JSON that cannot close its script element."""
     return Markup(json.dumps(content, allow_nan=False).replace("<", "\\u003c"))
 
 
 def relative_url(folder: Path, file: Path) -> str:
-    """The relative address of a file for a page in a folder."""
+    """The URL of a file relative to a page's folder."""
     return quote(Path(os.path.relpath(file, folder)).as_posix())

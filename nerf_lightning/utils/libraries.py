@@ -1,4 +1,4 @@
-"""Other packages: optional extras, Lightning's remarks and OpenMP's waiting."""
+"""Third-party packages: optional extras, Lightning's log messages, OpenMP's spin-waiting."""
 
 import importlib
 import logging
@@ -8,20 +8,22 @@ import warnings
 from nerf_lightning.errors import InputError
 
 LIGHTNING_LOGGERS = ("lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero")
-"""Loggers that report hardware and advice."""
 OPENMP_SPIN_COUNT = 2000
-"""Rounds that GNU's OpenMP waits (some microseconds) before it gives its core away. With its own 300,000 (a millisecond) two
-trainings side by side on two cores took 4 to 6 times as long as one alone, with this 1.8 times; alone nothing changes."""
+"""Spin iterations (some microseconds) before GNU OpenMP's threads yield their core. With the default, 300,000 (1 ms), two
+trainings in parallel on two cores took 4 to 6 times as long as one alone, with this 1.8 times; one alone is unaffected."""
 
 
 def require_extra(extra: str, *packages: str, purpose: str, hint: str = "") -> None:
-    """Raises InputError where a package of an optional extra is not installed.
+    """Checks that the packages of an optional extra are installed.
 
     Args:
         extra: its name in pyproject.toml.
-        packages: what it brings.
-        purpose: what it is for, in words.
-        hint: what else the user can do.
+        packages: modules of the extra.
+        purpose: for the message.
+        hint: an alternative, appended to the pip command.
+
+    Raises:
+        InputError: for the first package that is missing.
     """
     for package in packages:
         try:
@@ -34,7 +36,7 @@ def require_extra(extra: str, *packages: str, purpose: str, hint: str = "") -> N
 
 
 def silence_lightning() -> None:
-    """Silences Lightning's remarks on hardware and settings that this package chooses itself."""
+    """Silences Lightning's messages about hardware and settings that this package controls."""
     for name in LIGHTNING_LOGGERS:
         logging.getLogger(name).setLevel(logging.WARNING)
     for part in (
@@ -47,6 +49,6 @@ def silence_lightning() -> None:
 
 
 def limit_openmp_spinning() -> None:
-    """Sets `OPENMP_SPIN_COUNT`, before PyTorch is loaded, which reads it; unless the user's environment says how to wait."""
+    """Sets `OPENMP_SPIN_COUNT` before PyTorch is imported, unless the environment sets a wait policy."""
     if "OMP_WAIT_POLICY" not in os.environ:
         os.environ.setdefault("GOMP_SPINCOUNT", str(OPENMP_SPIN_COUNT))

@@ -1,4 +1,4 @@
-"""The machine of a run, and how much of it other work used: without them, seconds mean little."""
+"""Machine description and background CPU load, which timings depend on."""
 
 import os
 import platform
@@ -11,20 +11,20 @@ import psutil
 import torch
 
 MAX_BACKGROUND_LOAD = 0.1
-"""A machine counts as busy if other work took more than this share of a run's threads."""
+"""Background load, as a fraction of a run's threads, above which timings are unreliable."""
 MIN_LOAD_SECONDS = 0.5
-"""Shortest time, in seconds, over which the load can be measured: the system counts in hundredths."""
+"""Minimum duration of a load measurement: the system counts in 0.01 s."""
 
 
 def available_cores() -> int:
-    """Processor cores that this process may use."""
+    """CPU cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def processor_name() -> str:
-    """The processor's name, if the system knows it."""
+    """The CPU model, if the system knows it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:  # only Linux has it
@@ -34,7 +34,7 @@ def processor_name() -> str:
 
 
 def accelerator_name(device: torch.device) -> str | None:
-    """The name of the accelerator, or of its kind if unknown; None for a CPU."""
+    """The accelerator's name, or its device type if unknown; None for the CPU."""
     if device.type == "cpu":
         return None
     if device.type == "cuda":
@@ -43,7 +43,7 @@ def accelerator_name(device: torch.device) -> str | None:
 
 
 def describe_device(device: torch.device) -> str:
-    """For messages: "cpu", or for example "cuda (NVIDIA H100)"."""
+    """The device for messages: "cpu" or "cuda (NVIDIA H100)"."""
     name = accelerator_name(device)
     return device.type if name in (None, device.type) else f"{device.type} ({name})"
 
@@ -54,7 +54,7 @@ def describe_machine(device: torch.device) -> dict[str, Any]:
 
 
 def background_load(results: Mapping[str, Any]) -> float | None:
-    """Share of a run's threads taken by other work, which used more than the cores the run left free; None if unknown."""
+    """Fraction of a run's threads taken by other processes beyond the idle cores; None if unknown."""
     try:
         threads, cores = float(results["threads"]), float(results["machine"]["cores"])
         others = float(results["load"]["others"])
@@ -64,7 +64,7 @@ def background_load(results: Mapping[str, Any]) -> float | None:
 
 
 def _busy_seconds() -> float:
-    """CPU seconds of all cores since the machine started, without idle time."""
+    """Non-idle CPU seconds of all cores since boot."""
     times = psutil.cpu_times()
     idle = times.idle + getattr(times, "iowait", 0.0)
     guests = getattr(times, "guest", 0.0) + getattr(times, "guest_nice", 0.0)  # already part of the user time
@@ -72,7 +72,7 @@ def _busy_seconds() -> float:
 
 
 class CpuLoad:
-    """CPU seconds spent between `start` and `stop`, by this process and by everything else."""
+    """CPU time used between `start` and `stop` by this process and by others."""
 
     def __init__(self) -> None:
         self.seconds = self.own = self.others = 0.0
@@ -86,7 +86,7 @@ class CpuLoad:
         self._started = self._read_clocks()
 
     def stop(self) -> None:
-        """Adds the time since `start`, if it was called."""
+        """Accumulates the time since `start`, if it was called."""
         if self._started is None:
             return
         wall, own, busy = (now - then for now, then in zip(self._read_clocks(), self._started, strict=True))
@@ -94,7 +94,7 @@ class CpuLoad:
         self.seconds, self.own, self.others = self.seconds + wall, self.own + own, self.others + busy - own
 
     def average_cores(self) -> dict[str, float] | None:
-        """Cores in use on average; None if too little time has passed."""
+        """Average number of busy cores; None if less than `MIN_LOAD_SECONDS` were measured."""
         if self.seconds < MIN_LOAD_SECONDS:
             return None
         return {"own": round(self.own / self.seconds, 3), "others": round(max(0.0, self.others) / self.seconds, 3)}

@@ -1,4 +1,4 @@
-"""Free memory, a refusal of what does not fit into it (the system would kill the process silently), and the C allocator."""
+"""Free memory, checks against it (the system kills processes silently), and C allocator settings."""
 
 import ctypes
 import re
@@ -12,12 +12,12 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.device import CPU
 
 CGROUP_FOLDER = Path("/sys/fs/cgroup")
-"""Files on the memory of a Linux container."""
+"""Memory limits of a Linux container."""
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h of the GNU C library
 
 
 def free_memory(device: torch.device = CPU) -> float:
-    """Bytes that this process can still have: of an accelerator, or of the machine and its container."""
+    """Free bytes: of an accelerator, or of the machine within its container's limit."""
     if device.type == "cuda":
         return float(torch.cuda.mem_get_info(device)[0])
     if device.type == "mps":
@@ -34,50 +34,49 @@ def free_memory(device: torch.device = CPU) -> float:
 
 
 def fits_in_memory(size: int, device: torch.device) -> bool:
-    """Whether `size` bytes take at most half of an accelerator's free memory; always on a CPU, which holds them already."""
+    """Whether `size` bytes fit into half of an accelerator's free memory; always true on the CPU, which holds them already."""
     return device.type == "cpu" or size <= free_memory(device) / 2
 
 
 def check_memory(
     where: object, key: str, item: str, size: float, hint: str = "give less", device: torch.device = CPU
 ) -> None:
-    """Refuses what certainly needs more memory than is free.
+    """Checks that an allocation fits into free memory.
 
     Args:
         where, key, hint: see `InputError`.
-        item: what needs the memory, plural.
-        size: lower bound of its bytes.
-        device: whose memory.
+        item: what needs the memory, plural, for the message.
+        size: lower bound, bytes.
 
     Raises:
-        InputError: where more is needed than is free.
+        InputError: it does not.
     """
     free = free_memory(device)
     if not size <= free:
-        found, there = (f"{part / 2**30:,.1f} GiB" for part in (size, free))
-        raise InputError(where, key, f"{item} need at least {found}, and {there} are free", hint=hint)
+        needed, available = (f"{part / 2**30:,.1f} GiB" for part in (size, free))
+        raise InputError(where, key, f"{item} need at least {needed}, and {available} are free", hint=hint)
 
 
 def out_of_memory_error(error: BaseException) -> InputError | None:
-    """The error to report where memory has run out; None for one of another kind. CPUs say so only where a limit is set."""
+    """Converts an out-of-memory error to an InputError; None for other errors. CPUs raise one only under a limit."""
     if not isinstance(error, MemoryError | torch.OutOfMemoryError) and "allocate memory" not in str(error):
         return None
     size = re.search(r"allocate ([\d.]+ \w+)", str(error))
-    less = "dataset.rays, dataset.samples, dataset.pixels, limits.batch_scale or limits.chunk_samples"
-    found = f"no memory for {size[1] if size else 'a tensor'}"
-    return InputError("memory", "", found, hint=f"give less of {less}, or a smaller model")
+    options = "dataset.rays, dataset.samples, dataset.pixels, limits.batch_scale or limits.chunk_samples"
+    problem = f"no memory for {size[1] if size else 'a tensor'}"
+    return InputError("memory", "", problem, hint=f"give less of {options}, or a smaller model")
 
 
 def keep_freed_memory() -> None:
-    """Has the GNU C library keep freed memory. Otherwise every tensor above 128 kB gets newly mapped memory, with a fault
-    for each page: a fifth of a training step."""
-    with suppress(OSError, TypeError, AttributeError):  # Windows, macOS and musl do not have it
+    """Makes the GNU C library reuse freed memory. By default each tensor above 128 kB is mapped anew, and its page faults
+    take a fifth of a training step."""
+    with suppress(OSError, TypeError, AttributeError):  # no mallopt: Windows, macOS, musl
         # One arena, so that the next forward pass reuses what the backward pass's thread frees.
         for setting, value in ((_M_MMAP_THRESHOLD, 32 << 20), (_M_TRIM_THRESHOLD, 1 << 30), (_M_ARENA_MAX, 1)):
             ctypes.CDLL(None).mallopt(setting, value)
 
 
 def release_freed_memory() -> None:
-    """Returns kept memory to the system, where the C library can: between kinds of work, which need it in other pieces."""
+    """Returns freed memory to the system, where the C library can; called between phases with different allocation sizes."""
     with suppress(OSError, TypeError, AttributeError):
         ctypes.CDLL(None).malloc_trim(0)

@@ -1,4 +1,4 @@
-"""Checks options against the signature they configure, so that errors name the config's keys."""
+"""Checks of options against the signature they configure, with errors that name the config key."""
 
 import inspect
 import operator
@@ -13,14 +13,14 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.text import suggest
 
 MAX_INT = 2**63 - 1
-"""The largest whole number that tensors hold."""
+"""Largest int64."""
 MAX_FLOAT = (2 - 2**-23) * 2.0**127
-"""The largest number of single precision, in which nearly everything is computed."""
+"""Largest float32, the precision of nearly all computation."""
 
 
 @dataclass(frozen=True)
 class Bound:
-    """A bound on an option, stated in its annotation."""
+    """A bound on an option, part of its annotation."""
 
     phrase: str
     compare: Callable[[Any, float], bool]
@@ -32,25 +32,23 @@ Gt, Lt = partial(Bound, "above", operator.gt), partial(Bound, "below", operator.
 
 PositiveFloat = Annotated[float, Gt(0)]
 LossWeight = Annotated[float, Ge(0)]
-"""Of a term of the loss; 0 does without it."""
-
-
+"""Weight of a loss term; 0 disables it."""
 Count = Annotated[int, Ge(1)]
 GridSize = Annotated[int, Ge(1), Le(2**20)]
-"""Cells along a side of a grid: single precision tells 16 places within each apart, and their cube is below `MAX_INT`."""
+"""Grid resolution per axis: float32 resolves 16 positions per cell, and the cell count stays below `MAX_INT`."""
 Log2Size = Annotated[int, Ge(1), Le(30)]
-"""Logarithm of the entries of a table, which are indexed with 32 bits."""
+"""Log2 of a table's number of entries, which are indexed with 32 bits."""
 Layers = Annotated[int, Ge(1), Le(1024)]
-"""Layers or levels, which are made and run one after the other."""
+"""Number of layers or levels."""
 Frequencies = Annotated[int, Ge(0), Le(127)]
-"""A number of frequencies, each twice the one before: the next is infinite in single precision."""
+"""Number of octaves of a frequency encoding: 2^128 overflows float32."""
 Fraction = Annotated[float, Ge(0), Le(1)]
 SHDegree = Annotated[int, Ge(0), Le(3)]
-"""Of spherical harmonics."""
+"""Degree of spherical harmonics."""
 Seed = Annotated[int, Ge(0), Le(2**32 - 1)]
 Port = Annotated[int, Ge(0), Le(65535)]
 FramesPerSecond = Annotated[float, Ge(0.01), Le(1000)]
-"""Films state how long a frame stays in thousandths of a second."""
+"""Frame rate: videos store frame durations in milliseconds."""
 
 
 def check_options(
@@ -61,15 +59,18 @@ def check_options(
     require_all: bool = True,
     source: str = "config",
 ) -> None:
-    """Raises InputError if an option is unknown, missing, of the wrong type, not finite or out of its bounds.
+    """Checks options against the parameters of a class or function.
 
     Args:
-        where: the config group, for the message; "" for the top level.
-        target: the class or function that takes the options.
-        options: names and plain values.
-        bound_arguments: names of further arguments that will be passed.
-        require_all: whether the target gets no other arguments later.
-        source: what holds the options, for the message.
+        where: config group, for the message; "" for the top level.
+        target: class or function that takes the options.
+        options: plain values by name.
+        bound_arguments: names of arguments passed separately.
+        require_all: whether missing options are errors.
+        source: file or command that holds the options, for the message.
+
+    Raises:
+        InputError: an option is unknown, missing, of the wrong type, not finite or out of bounds.
     """
     parameters = inspect.signature(target).parameters
     hints = typing.get_type_hints(target.__init__ if inspect.isclass(target) else target, include_extras=True)
@@ -93,7 +94,7 @@ def check_options(
 
 
 def _matches_type(value: Any, annotation: Any) -> bool:
-    """Whether a value from YAML fits an annotation; annotations other than plain values always fit."""
+    """Whether a YAML value matches an annotation; class annotations match any mapping or list."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         bounds = [bound for bound in arguments[1:] if isinstance(bound, Bound)]
@@ -112,12 +113,11 @@ def _matches_type(value: Any, annotation: Any) -> bool:
         return isinstance(value, int) and not isinstance(value, bool) and abs(value) <= MAX_INT
     if annotation in (str, bool, type(None)):
         return isinstance(value, annotation)
-    # YAML cannot hold other classes, but a mapping may describe one (with a target of its own).
+    # YAML holds no other classes, but a mapping may describe one (by its `_target_`).
     return annotation is Any or not inspect.isclass(annotation) or isinstance(value, (annotation, Mapping, list))
 
 
 def _describe_type(annotation: Any) -> str:
-    """An annotation in words."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Annotated:
         bounds = [f"{bound.phrase} {bound.value:.12g}" for bound in arguments[1:] if isinstance(bound, Bound)]

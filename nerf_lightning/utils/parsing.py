@@ -1,4 +1,4 @@
-"""JSON, YAML and .npz files from outside: read whole or refused in one line. Nothing in them is executed."""
+"""Safe readers of JSON, YAML, .npz and .npy files: one-line errors, bounded memory, no code execution."""
 
 import io
 import json
@@ -19,18 +19,18 @@ from nerf_lightning.utils.memory import check_memory
 
 MAX_YAML_BYTES = 1 << 20
 JSON_MEMORY_PER_BYTE = 32
-"""Of memory for a byte of JSON: `{},` becomes 72 bytes."""
+"""Memory per byte of JSON: `{},` becomes 72 bytes."""
 VALUE_ERRORS = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
-"""What Python and libraries raise for values of a wrong kind, where a file's content goes through code that trusts it."""
+"""Raised by Python and libraries for invalid values in a file's content."""
 DAMAGE_ERRORS = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, OSError, tokenize.TokenError, SyntaxError),
     *VALUE_ERRORS,
 )
-"""What zipfile, NumPy and PyTorch raise for a damaged file."""
+"""Raised by zipfile, NumPy and PyTorch for a damaged file."""
 
 
 def require_file(path: Path, expected: str = "a file", missing_hint: str = "check the path") -> Path:
-    """Refuses a folder, and what is no regular file, as a pipe may never end; `missing_hint` is for the message."""
+    """Checks that a path is a regular file: a pipe may never end."""
     if path.is_dir():
         raise InputError(path, "", "a folder", expected)
     if not path.is_file():
@@ -39,10 +39,10 @@ def require_file(path: Path, expected: str = "a file", missing_hint: str = "chec
 
 
 def read_file(path: Path, expected: str = "a file that can be read", memory_per_byte: float = 1) -> bytes:
-    """All bytes of a file, of which each will need `memory_per_byte` bytes of memory.
+    """The content of a file; `memory_per_byte` is what parsing takes.
 
     Raises:
-        InputError: it is missing, cannot be read, or is too large for the memory that is left.
+        InputError: the file is missing, unreadable, or too large for free memory.
     """
     require_file(path, expected)
     try:
@@ -53,19 +53,19 @@ def read_file(path: Path, expected: str = "a file that can be read", memory_per_
 
 
 def read_json(path: Path, expected: str, hint: str = "export it again") -> Any:
-    """What a JSON file holds, in UTF-8, UTF-16 or UTF-32; `expected` and `hint` are for messages.
+    """Parses a JSON file in UTF-8, UTF-16 or UTF-32; `expected` and `hint` are for messages.
 
     Raises:
-        InputError: as `read_file`, and where it is no JSON.
+        InputError: as `read_file`, and for invalid JSON.
     """
     return parse_json(read_file(path, expected, JSON_MEMORY_PER_BYTE), path, expected, hint)
 
 
 def parse_json(content: bytes, where: object, expected: str, hint: str = "") -> Any:
-    """As `read_json`, of a file's content; `where` it came from is for messages.
+    """Parses JSON from bytes; `where` names their source in messages.
 
     Raises:
-        InputError: it is no JSON.
+        InputError: invalid JSON.
     """
     try:
         return json.loads(content.decode(json.detect_encoding(content)))
@@ -74,7 +74,7 @@ def parse_json(content: bytes, where: object, expected: str, hint: str = "") -> 
 
 
 class _PlainLoader(yaml.SafeLoader):
-    """A SafeLoader without aliases, of which a few lines can stand for any amount of values."""
+    """A SafeLoader without aliases: a few lines of them expand to unbounded memory."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         if self.check_event(yaml.AliasEvent):
@@ -85,17 +85,17 @@ class _PlainLoader(yaml.SafeLoader):
 
 
 def read_yaml(path: Path, expected: str, hint: str = "") -> Any:
-    """What a YAML file holds: plain values; `expected` and `hint` are for messages.
+    """Parses a YAML file into plain values; `expected` and `hint` are for messages.
 
     Raises:
-        InputError: as `read_file`, and where it is no YAML, larger than `MAX_YAML_BYTES`, or has aliases.
+        InputError: as `read_file`, and for invalid YAML, aliases, or more than `MAX_YAML_BYTES`.
     """
     if (size := require_file(path, expected).stat().st_size) > MAX_YAML_BYTES:
         raise InputError(path, "", f"{size} bytes", f"{expected}, of at most {MAX_YAML_BYTES} bytes", hint)
     content = read_file(path, expected)
     try:
         return yaml.load(content.decode("utf-8-sig"), _PlainLoader)  # noqa: S506  (a SafeLoader)
-    except (yaml.YAMLError, *VALUE_ERRORS) as error:  # Python's own for a date or a number that is none
+    except (yaml.YAMLError, *VALUE_ERRORS) as error:  # VALUE_ERRORS: invalid dates and numbers
         raise InputError(path, "", f"unreadable as {expected} ({type(error).__name__}: {error})", hint=hint) from error
 
 
@@ -109,12 +109,12 @@ def read_npz(
 
     Args:
         source: the file, or its content.
-        keys: names of the arrays to read, as far as they are there; None reads all.
-        where: a content came from, for messages.
+        keys: names of the arrays to read, if present; None reads all.
+        where: origin of bytes, for messages.
         expected: for messages.
 
     Raises:
-        InputError: it is no such file, is damaged, holds pickled objects, or unpacks to more than fits into memory.
+        InputError: the file is no .npz, damaged, holds pickled objects, or unpacks to more than free memory.
     """
     if isinstance(source, Path):
         where = require_file(source, expected)
@@ -134,7 +134,7 @@ def read_npy(path: Path) -> np.ndarray:
     """The array of an .npy file.
 
     Raises:
-        InputError: it is no such file, is damaged or cut short, or holds pickled objects.
+        InputError: the file is no .npy, damaged, or holds pickled objects.
     """
     require_file(path)
     check_memory(path, "", "an array", path.stat().st_size)

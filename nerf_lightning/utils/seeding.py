@@ -1,31 +1,31 @@
-"""Random numbers that depend only on (seed, stream, step), so that a resumed run draws what an uninterrupted one would."""
+"""Random generators determined by (seed, stream, step), so that a resumed run draws what an uninterrupted one does."""
 
 from enum import IntEnum
 
 import torch
 
-_SEED_MULTIPLIER = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: consecutive steps land far apart in the seed space
+_SEED_MULTIPLIER = 0x9E3779B97F4A7C15  # 2^64 / golden ratio: decorrelates consecutive steps
 
 
 class Stream(IntEnum):
-    """Each use of random numbers draws from a stream of its own. Changing a number changes what is drawn."""
+    """Independent random streams. Changing a number changes what is drawn."""
 
     BATCH = 0
-    """Which rays or pixels a step trains on."""
+    """Rays or pixels of a training step."""
     STEP = 1
     """Jitter, random backgrounds and occupancy updates within a step."""
     BASELINE = 2
-    """Pixels that the error of one plain colour is measured on."""
+    """Pixels for the error of a constant colour."""
     RESTART = 3
-    """Fresh weights after a breakdown."""
+    """New initial weights after divergence."""
     ANALYSIS = 4
-    """Experiments on a scene or a trained field: damage, other samplers."""
+    """Experiments on a scene or a trained field: corruptions, other samplers."""
     REFINEMENT_TRIAL = 5
-    """Pixels that decide whether cameras and light are corrected."""
+    """Pixels that decide whether poses and exposures are refined."""
 
 
 def step_generator(seed: int, stream: Stream, step: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """A fresh generator for one step of one stream."""
+    """A new generator for a step of a stream."""
     mixed = ((seed * 1_000_003 + stream) * _SEED_MULTIPLIER + step * 0xBF58476D1CE4E5B9) & (2**63 - 1)
     # The CPU's generator uses only the low half.
     return torch.Generator(device).manual_seed(mixed ^ (mixed >> 32))

@@ -1,4 +1,4 @@
-"""SIGINT (Ctrl-C) and SIGTERM: the first one ends the process in order, with exit code 128 + signal, the second one at once."""
+"""SIGINT (Ctrl-C) and SIGTERM: the first shuts down cleanly with exit code 128 + signal, the second exits at once."""
 
 import os
 import signal
@@ -16,7 +16,7 @@ _is_deferred = False
 
 
 class SignalInterrupt(BaseException):
-    """A signal; `hint` says what continues the work. No KeyboardInterrupt, which Lightning turns into exit code 1."""
+    """Raised for a signal; `hint` says how to continue. Not a KeyboardInterrupt, which Lightning turns into exit code 1."""
 
     def __init__(self, signum: int, hint: str = RESUME_HINT):
         super().__init__(signum)
@@ -25,7 +25,7 @@ class SignalInterrupt(BaseException):
 
 @contextmanager
 def handle_signals() -> Iterator[None]:
-    """A signal raises `SignalInterrupt`, inside `defer_signals` at the end of that. Nested, it does nothing."""
+    """Makes signals raise `SignalInterrupt`, at the end of an enclosing `defer_signals`. No effect when nested."""
     global _received_signal
     handlers = {signum: signal.getsignal(signum) for signum in SIGNALS}
     if _handle in handlers.values() or threading.current_thread() is not threading.main_thread():
@@ -43,7 +43,7 @@ def handle_signals() -> Iterator[None]:
 
 
 def install_handlers() -> None:
-    """Takes both signals, also back from Lightning, whose handler of SIGTERM ends a training with exit code 0."""
+    """Installs both handlers, also over Lightning's, whose SIGTERM handler exits with code 0."""
     if threading.current_thread() is threading.main_thread():
         for signum in SIGNALS:
             signal.signal(signum, _handle)
@@ -51,11 +51,11 @@ def install_handlers() -> None:
 
 @contextmanager
 def exit_on_signal() -> Iterator[None]:
-    """`handle_signals` for a command line: prints one line and exits."""
+    """As `handle_signals`, but prints one line and exits."""
     with handle_signals():
         try:
             yield
-        except BaseException as error:  # a library may have turned `SignalInterrupt` into an error of its own
+        except BaseException as error:  # a library may have wrapped `SignalInterrupt`
             if _received_signal is None:
                 raise
             hint = error.hint if isinstance(error, SignalInterrupt) else RESUME_HINT
@@ -69,7 +69,7 @@ def exit_on_signal() -> Iterator[None]:
 
 @contextmanager
 def defer_signals(deferred: bool = True) -> Iterator[None]:
-    """Defers the first signal to the end of a block; with False, lets it interrupt a part of such a block."""
+    """Defers the first signal to the end of a block; False allows it again inside such a block."""
     global _is_deferred
     before, _is_deferred = _is_deferred, deferred
     try:
@@ -83,7 +83,7 @@ def defer_signals(deferred: bool = True) -> Iterator[None]:
 
 
 def received_signal() -> int | None:
-    """The signal that asks this process to end, if one has come."""
+    """The signal received, or None."""
     return _received_signal
 
 
@@ -93,7 +93,7 @@ def raise_if_signalled() -> None:
 
 
 def _resend_signal(hook: Callable[["sys.UnraisableHookArgs"], object], lost: "sys.UnraisableHookArgs") -> None:
-    """Sends a signal once more whose `SignalInterrupt` could not be raised, as in the callbacks of Numba's compiler."""
+    """Resends a signal whose `SignalInterrupt` was swallowed, as in Numba's compiler callbacks."""
     global _received_signal
     if isinstance(lost.exc_value, SignalInterrupt):
         _received_signal = None

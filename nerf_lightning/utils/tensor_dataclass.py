@@ -1,4 +1,4 @@
-"""TensorDataclass: dataclasses of tensors that move between devices as one."""
+"""Dataclasses of tensors that move between devices as one."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -12,10 +12,10 @@ T = TypeVar("T", bound="TensorDataclass")
 
 @dataclass(frozen=True)
 class TensorDataclass:
-    """Base of frozen dataclasses whose fields are tensors, further ones of these, or plain values."""
+    """Base of frozen dataclasses whose fields are tensors, other TensorDataclasses, or plain values."""
 
     def map_tensors(self: T, operation: Callable[[Tensor], Tensor]) -> T:
-        """A copy with an operation applied to each tensor; plain values stay."""
+        """A copy with an operation applied to each tensor."""
         changed: dict[str, object] = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -26,13 +26,11 @@ class TensorDataclass:
         return replace(self, **changed)
 
     def to(self: T, device: torch.device | str) -> T:
-        """A copy on a device."""
         return self.map_tensors(lambda x: x.to(device))
 
     def detach(self: T) -> T:
-        """A copy without gradient."""
         return self.map_tensors(Tensor.detach)
 
     def __getitem__(self: T, index: slice | Tensor) -> T:
-        """Some of the rows."""
+        """Indexes the first dimension of each tensor."""
         return self.map_tensors(lambda x: x[index])

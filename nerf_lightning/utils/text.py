@@ -1,4 +1,4 @@
-"""Small helpers for lists and sentences."""
+"""Helpers for lists and messages."""
 
 import difflib
 from collections.abc import Iterable, Sequence
@@ -12,12 +12,12 @@ def subsample(total: int, count: int | None) -> list[int]:
 
 
 def suggest(name: str, known: Iterable[str], prefix: str = "") -> str:
-    """A question with the nearest known name, after a prefix; "" where none is near."""
+    """ "did you mean PREFIX+NAME?" with the closest known name; "" if none is close."""
     near = difflib.get_close_matches(name, list(known), 1)
     return f"did you mean {prefix}{near[0]}?" if near else ""
 
 
 def join_truncated(names: Sequence[str], limit: int) -> str:
-    """At most so many of the names, and how many more there are."""
+    """Joins at most `limit` names and appends the number left out."""
     rest = f" and {len(names) - limit} more" if len(names) > limit else ""
     return ", ".join(names[:limit]) + rest

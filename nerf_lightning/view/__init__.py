@@ -1,1 +1,1 @@
-"""A trained run or a scene in the browser."""
+"""Browser viewers of trained runs and scenes, based on Viser."""

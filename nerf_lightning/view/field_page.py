@@ -1,4 +1,4 @@
-"""A trained field as a page in the browser: turned with the mouse, with the cameras that saw it."""
+"""Viewer page of a trained field, with its training cameras."""
 
 import math
 import threading
@@ -22,37 +22,37 @@ from nerf_lightning.view.page import Page
 from nerf_lightning.view.progressive import ProgressiveRenderer, ViewRequest
 
 FIRST_IMAGE_SECONDS = 0.08
-"""Time to render the first picture after a movement: with encoding and transport it arrives within 0.2 s."""
+"""Render time of the first image after a camera movement; it arrives within 0.2 s."""
 REFINEMENT_FACTOR = 2
-"""Times as many pixels along each side in each further picture, while the camera rests."""
+"""Factor on width and height of each further image while the camera rests."""
 JPEG_QUALITY = 80
-"""Of the JPEG that is sent, out of 100."""
+"""JPEG quality, 0 to 100."""
 
 
 @dataclass
 class ClientState:
-    """A browser that has the page open, and what it has been sent."""
+    """A connected browser and its current image."""
 
     client: viser.ClientHandle
     version: int = 0
-    """Goes up whenever what it wants changes."""
+    """Incremented with every change of camera or options."""
     side: int = 0
-    """Pixels along the longer side of the picture it has of this version; 0 for none."""
+    """Longer side of its image of this version, pixels; 0 for none."""
     last_render_time: float = 0.0
-    """When it got its last picture, seconds of the monotonic clock."""
+    """Monotonic time of its last image, seconds."""
 
 
 class FieldPage(Page):
-    """Serves a field. `render_next` renders one picture; `run` calls it for ever.
+    """Serves a field: `run` repeatedly calls `render_next`, which renders one image.
 
     Args:
-        name: the page's title.
-        system: what is shown.
-        orbit: its first view is the page's.
-        scene: the photos, whose cameras can then be shown; None for none.
+        name: title.
+        system: the system to render.
+        orbit: its first view is the home view.
+        scene: photos with cameras to show, if any.
         host, port: see `Page`.
-        most: pixels along the longer side of the finest picture.
-        live: whether `show_progress` will be called.
+        max_side: longer side of the finest image, pixels.
+        live: whether to show training progress.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class FieldPage(Page):
             self.clients.pop(client.client_id, None)
 
     def _request_images(self, *clients: ClientState) -> None:
-        """Marks what some visitors see as out of date; all visitors if none is named."""
+        """Invalidates the images of the given clients; of all if none is given."""
         with self.view_changed:
             for client_state in clients or tuple(self.clients.values()):
                 client_state.version += 1
@@ -109,19 +109,19 @@ class FieldPage(Page):
         if live:
             self.bar, self.progress = gui.add_progress_bar(0.0), gui.add_markdown("")
         gui.add_markdown(
-            "Drag to turn, right-drag to move, scroll to zoom. Click into the picture to see a ray's samples."
+            "Drag to turn, right-drag to move, scroll to zoom. Click into the image to see a ray's samples."
         )
         gui.add_button("reset view").on_click(self.go_home)
-        with gui.add_folder("picture"):
+        with gui.add_folder("image"):
             self.channel = gui.add_dropdown("channel", CHANNELS)
             self.background = gui.add_dropdown("background", tuple(self.backgrounds))
             self.max_side = gui.add_slider(
                 "resolution", 64, 2048, 32, min(max(max_side, 64), 2048), hint="longer side, pixels"
             )
-            most_far = float(f"{3 * self.scale:.2g}")
-            step = most_far / 200
-            self.near = gui.add_slider("near", 0.0, most_far, step, 0.0, hint="hide what is nearer")
-            self.far = gui.add_slider("far", 0.0, most_far, step, most_far, hint="hide what is farther")
+            max_far = float(f"{3 * self.scale:.2g}")
+            step = max_far / 200
+            self.near = gui.add_slider("near", 0.0, max_far, step, 0.0, hint="hide what is nearer")
+            self.far = gui.add_slider("far", 0.0, max_far, step, max_far, hint="hide what is farther")
             for control in (self.channel, self.background, self.max_side, self.near, self.far):
                 control.on_update(lambda _: self._request_images())
         with gui.add_folder("show"):
@@ -137,43 +137,43 @@ class FieldPage(Page):
         self.status = gui.add_markdown("")
 
     def click(self, origin: tuple[float, float, float], direction: tuple[float, float, float]) -> None:
-        """Called on a click into the picture: the next `render_next` draws that ray."""
+        """Handles a click into the image: the next `render_next` draws its ray."""
         ahead = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float32), dim=0)
         self.clicked = Rays(torch.tensor(origin, dtype=torch.float32)[None], ahead[None])
         with self.view_changed:
             self.view_changed.notify_all()
 
     def show_progress(self, fraction: float, words: str) -> None:
-        """Shows how far a live training is.
+        """Shows the progress of a live training.
 
         Args:
-            share: done, in [0, 1].
+            fraction: in [0, 1].
             words: step, quality and time left.
         """
         self.bar.value, self.progress.content = 100 * fraction, words  # type: ignore[misc]  # settable
 
     def draw_ray(self, ray: Rays) -> None:
-        """Draws one ray within the bounds and its samples, and prints what was rendered along it."""
+        """Draws a ray and its samples within the bounds, and shows its rendered values."""
         device = self.system.device
         ray = ray.to(device)
         with torch.no_grad():
             samples = self.system.sampler(ray, self.system.field.density)
-            places = samples.positions(ray)
+            positions = samples.positions(ray)
             rendered = self.system.render(ray)
         near, far = (end.cpu() for end in self.system.field.bounds.near_far(ray))
         far = torch.minimum(torch.maximum(far, near), near + 4 * self.scale)
         ends = torch.stack([ray.origins.cpu() + t[:, None] * ray.directions.cpu() for t in (near, far)], dim=1)
         with self.draw_lock, self.server.atomic():
             self.draw_lines("/ray/inside", ends.numpy(), parse_hex_colour(GREEN))
-            self.points("/ray/samples", places.cpu().numpy(), parse_hex_colour(VERMILLION), 0.006)
-        colour = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])
+            self.points("/ray/samples", positions.cpu().numpy(), parse_hex_colour(VERMILLION), 0.006)
+        color = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])
         depth, opacity = float(rendered.depth[0]), float(rendered.opacity[0])
         self.status.content = (
-            f"clicked: {len(samples)} samples, colour {colour}, opacity {opacity:.2f}, depth {depth:.3f}"
+            f"clicked: {len(samples)} samples, colour {color}, opacity {opacity:.2f}, depth {depth:.3f}"
         )
 
     def build_request(self, client_state: ClientState) -> ViewRequest:
-        """The picture that a visitor asks for now."""
+        """The image that a client currently requests."""
         camera = client_state.client.camera
         c2w = np.eye(4)
         c2w[:3, :3] = SO3(camera.wxyz).as_matrix()
@@ -185,19 +185,19 @@ class FieldPage(Page):
         )
 
     def next_client(self) -> ClientState | None:
-        """The visitor with the coarsest picture; None if all have the finest they want."""
+        """The client with the coarsest image; None if all images have full resolution."""
         with self.view_changed:
-            behind = [one for one in self.clients.values() if one.version and one.side < self.max_side.value]
-            return min(behind, key=lambda one: (one.side, one.last_render_time), default=None)
+            pending = [state for state in self.clients.values() if state.version and state.side < self.max_side.value]
+            return min(pending, key=lambda state: (state.side, state.last_render_time), default=None)
 
     def render_next(self, seconds: float = FIRST_IMAGE_SECONDS) -> bool:
-        """Renders what is wanted most, once.
+        """Renders one image for the client with the coarsest.
 
         Args:
-            seconds: that the first picture of a view may take; finer ones take longer.
+            seconds: render time of the first image of a view.
 
         Returns:
-            Whether there was anything to do.
+            Whether there was anything to render.
         """
         if self.clicked is not None:
             ray, self.clicked = self.clicked, None
@@ -205,14 +205,14 @@ class FieldPage(Page):
         client_state = self.next_client()
         if client_state is None:
             return False
-        version, had = client_state.version, client_state.side
-        wish = self.build_request(client_state)
-        first = self.painter.estimate_side(wish, seconds)
-        side = first if not had else min(max(REFINEMENT_FACTOR * had, first), wish.max_side)
-        picture = self.painter.render(wish, side, lambda: client_state.version == version)
-        if picture is None:
+        version, previous = client_state.version, client_state.side
+        request = self.build_request(client_state)
+        first = self.painter.estimate_side(request, seconds)
+        side = first if not previous else min(max(REFINEMENT_FACTOR * previous, first), request.max_side)
+        image = self.painter.render(request, side, lambda: client_state.version == version)
+        if image is None:
             return True
-        client_state.client.scene.set_background_image(picture, format="jpeg", jpeg_quality=JPEG_QUALITY)
+        client_state.client.scene.set_background_image(image, format="jpeg", jpeg_quality=JPEG_QUALITY)
         with self.view_changed:
             if client_state.version == version:
                 client_state.side = max(side, 1)
@@ -220,12 +220,12 @@ class FieldPage(Page):
         return True
 
     def invalidate(self) -> None:
-        """Called when the field has changed: all visitors get a new picture."""
+        """Requests new images for all clients, after the field has changed."""
         self.painter.reset_depth_range()
         self._request_images()
 
     def run(self, ended: Callable[[], bool] = lambda: False) -> None:
-        """Paints whenever a picture is wanted, until `ended`."""
+        """Renders requested images until `ended`."""
         while not ended():
             if not self.render_next():
                 with self.view_changed:

@@ -1,4 +1,4 @@
-"""What all pages in the browser share, served by Viser: lights, cameras with their photos, lines, points and checkboxes."""
+"""Base of the viewer pages: lights, camera frusta with photos, lines, points and checkboxes."""
 
 import contextlib
 import io
@@ -15,25 +15,25 @@ from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.drawing.style import BLUE, ORANGE, parse_hex_colour
 from nerf_lightning.view.geometry import Frustum, Viewpoint, get_photo_viewpoint, iterate_frusta
 
-SPLIT_COLOURS = {"training": parse_hex_colour(BLUE), "held out": parse_hex_colour(ORANGE)}
-"""Of the cameras of a split."""
+SPLIT_COLORS = {"training": parse_hex_colour(BLUE), "held out": parse_hex_colour(ORANGE)}
+"""Frustum colours by split."""
 MAX_PHOTO_SIDE = 160
-"""Longest side of the photos on the frusta, pixels."""
+"""Longest side of photos on frusta, pixels."""
 LINE_WIDTH = 1.5
-"""Width of lines, screen pixels."""
+"""Line width, screen pixels."""
 FRUSTUM_DEPTH_FRACTION = 0.12
-"""Depth of a frustum at first, as a share of the cameras' distance to what they look at."""
+"""Default depth of a frustum, relative to the page's scale."""
 
 
 class Page:
-    """Serves a page from a thread of its own until `stop`.
+    """Serves a page from a background thread until `stop`.
 
     Args:
-        name: its title.
-        home: the first view.
-        scale: of everything drawn on the page, world units.
+        name: title.
+        home: first view.
+        scale: cameras' distance to the focus, world units; sizes are relative to it.
         host: address to listen on.
-        port: where to listen; the next free one where it is taken.
+        port: the next free one if taken.
     """
 
     def __init__(self, name: str, home: Viewpoint, scale: float, host: str, port: int):
@@ -53,7 +53,7 @@ class Page:
         return self.server.get_port()
 
     def run(self) -> None:
-        """Waits for ever; the server has threads of its own."""
+        """Blocks for ever; the server runs in background threads."""
         threading.Event().wait()
 
     def stop(self) -> None:
@@ -61,7 +61,7 @@ class Page:
             self.server.stop()
 
     def set_up_scene(self) -> None:
-        """Lights, sizes and the first view; nothing that a browser would load from elsewhere."""
+        """Sets lights, sizes and the first view; disables content that browsers would download."""
         scene, gui, camera = self.server.scene, self.server.gui, self.server.initial_camera
         gui.configure_theme(show_logo=False, show_share_button=False)
         gui.set_panel_label(self.name)
@@ -77,7 +77,7 @@ class Page:
             client.camera.min_orbit_distance = min(1e-2, 1e-3 * self.scale)
 
     def add_cameras(self, shown: Scene, visible: bool = True) -> None:
-        """Frusta and their names, one group for each split, shown and hidden as one."""
+        """Adds frusta and their names, one group per split."""
         scene = self.server.scene
         for word, views in (("training", shown.train), ("held out", shown.val)):
             group = word.replace(" ", "_")
@@ -93,7 +93,7 @@ class Page:
                     scale=viser_scale(frustum, FRUSTUM_DEPTH_FRACTION * self.scale),
                     thickness=LINE_WIDTH,
                     thickness_units="screen",
-                    color=SPLIT_COLOURS[word],
+                    color=SPLIT_COLORS[word],
                     image=frustum.photo,
                     wxyz=wxyz,
                     position=position,
@@ -105,11 +105,11 @@ class Page:
                 scene.add_label(f"/{group}/names/{i}", frustum.name, position=position, font_screen_scale=0.8)
 
     def _visit(self, frustum: Frustum) -> Callable[[viser.SceneNodePointerEvent], None]:
-        """A click on a frustum moves the browser's camera there."""
+        """Click handler that moves the browser's camera to a frustum."""
         return lambda event: look_from(event.client, get_photo_viewpoint(frustum, self.scale, self.home.up))
 
     def add_camera_checkboxes(self) -> None:
-        """Checkboxes for what to show of the cameras."""
+        """Adds checkboxes for cameras, names and photos."""
         gui = self.server.gui
         for word, group in self.groups.items():
             self.add_checkbox(word, group)
@@ -120,7 +120,7 @@ class Page:
         self.depth.on_update(lambda _: self.size_frusta())
 
     def add_checkbox(self, word: str, *handles: viser.SceneNodeHandle | None) -> None:
-        """A checkbox that shows and hides scene nodes; none where there is nothing to show."""
+        """Adds a checkbox for the visibility of scene nodes, if any exists."""
         present = [handle for handle in handles if handle is not None]
         if not present:
             return
@@ -146,31 +146,30 @@ class Page:
             for frustum, handle in self.frusta:
                 handle.scale = viser_scale(frustum, self.depth.value * self.scale)
 
-    def draw_lines(self, name: str, segments: np.ndarray, colour: tuple[int, int, int]) -> None:
-        """Line segments [N, 2, 3] under a name, in place of what it had."""
+    def draw_lines(self, name: str, segments: np.ndarray, color: tuple[int, int, int]) -> None:
+        """Draws line segments [N, 2, 3], replacing the node `name`."""
         if not len(segments):
             self.server.scene.remove_by_name(name)
             return
-        self.server.scene.add_line_segments(name, segments, colour, thickness=LINE_WIDTH, thickness_units="screen")
+        self.server.scene.add_line_segments(name, segments, color, thickness=LINE_WIDTH, thickness_units="screen")
 
-    def points(self, name: str, points: np.ndarray, colour: tuple[int, int, int] | np.ndarray, size: float) -> None:
-        """Points [N, 3] under a name, in place of what it had, of one colour or [N, 3]; `size` is a share of the scene's
-        scale."""
+    def points(self, name: str, points: np.ndarray, color: tuple[int, int, int] | np.ndarray, size: float) -> None:
+        """Draws points [N, 3] in one colour or [N, 3], replacing the node `name`; `size` is relative to `scale`."""
         if not len(points):
             self.server.scene.remove_by_name(name)
             return
         self.server.scene.add_point_cloud(
-            name, points, colour, point_size=size * self.scale, point_shape="circle", precision="float32"
+            name, points, color, point_size=size * self.scale, point_shape="circle", precision="float32"
         )
 
 
 def viser_scale(frustum: Frustum, depth: float) -> float:
-    """The scale at which Viser draws a frustum `depth` deep: it sizes frusta by their volume, d^3 tan^2(fov/2) aspect / 3."""
+    """Viser's scale of a frustum of a given depth: Viser sizes frusta by volume, d^3 tan^2(fov/2) aspect / 3."""
     return depth * math.cbrt(math.tan(frustum.fov / 2) ** 2 * frustum.aspect / 3)
 
 
 def look_from(client: viser.ClientHandle, viewpoint: Viewpoint) -> None:
-    """Puts a browser's camera somewhere, at once."""
+    """Moves a browser's camera to a viewpoint."""
     with client.atomic():
         client.camera.up_direction = viewpoint.up
         client.camera.position = viewpoint.position
@@ -179,5 +178,5 @@ def look_from(client: viser.ClientHandle, viewpoint: Viewpoint) -> None:
 
 
 def _silence_stdout() -> contextlib.AbstractContextManager[object]:
-    """Viser always announces its start and stop; the command prints a line of its own."""
+    """Suppresses Viser's start and stop messages."""
     return contextlib.redirect_stdout(io.StringIO())

@@ -1,4 +1,4 @@
-"""Pictures for a browser: coarse at first, then finer, and dropped as soon as they are out of date."""
+"""Progressive rendering for browsers: coarse to fine, cancelled when outdated."""
 
 import math
 import time
@@ -18,14 +18,14 @@ from nerf_lightning.utils.device import synchronize
 from nerf_lightning.utils.text import subsample
 
 CHUNKS_PER_CHECK = 4
-"""Chunks of rays rendered between two checks of whether the picture is still wanted."""
+"""Chunks of rays rendered between two checks for cancellation."""
 MIN_SIDE = 24
-"""Pixels along the longer side below which no picture is worth sending."""
+"""Minimum longer side of an image, pixels."""
 
 
 @dataclass(frozen=True)
 class ViewRequest:
-    """The picture that a browser asks for."""
+    """Camera and options of an image that a browser requests."""
 
     c2w: Float[ndarray, "4 4"]
     """OpenCV frame, camera to world."""
@@ -36,13 +36,13 @@ class ViewRequest:
     channel: str
     background: tuple[float, float, float]
     near: float
-    """World units along each ray; nearer parts are cut away."""
+    """Near clipping distance along rays, world units."""
     far: float
     max_side: int
-    """Pixels along the longer side of the finest picture."""
+    """Longer side of the finest image, pixels."""
 
     def cameras(self, side: int) -> Cameras:
-        """One view, `side` pixels along its longer side."""
+        """The camera at `side` pixels along the longer side."""
         width = max(1, round(side * min(1.0, self.aspect)))
         height = max(1, round(side / max(1.0, self.aspect)))
         focal = height / (2 * math.tan(self.fov / 2))
@@ -51,52 +51,54 @@ class ViewRequest:
 
 
 class ProgressiveRenderer:
-    """Renders wishes with a system, at sizes that suit the speed measured so far.
+    """Renders requests at resolutions chosen from the measured speed.
 
     Args:
         system: trained, or in training.
-        orbit: views from which the range of depths is found.
+        orbit: views that determine the depth range.
     """
 
     def __init__(self, system: NeRF3D, orbit: Cameras):
         self.system = system
         self.orbit = orbit
         self.rays_per_second = 50_000.0
-        """Rays a second, measured; at first a guess."""
+        """Running mean of the rendering speed; initially a guess."""
         self._depths: tuple[float, float] | None = None
 
-    def estimate_side(self, wish: ViewRequest, seconds: float) -> int:
-        """Pixels along the longer side of a picture that should take `seconds`."""
+    def estimate_side(self, request: ViewRequest, seconds: float) -> int:
+        """Longer side of an image that takes about `seconds` to render, pixels."""
         area = self.rays_per_second * seconds
-        ratio = min(wish.aspect, 1 / wish.aspect)
-        return int(min(max(math.sqrt(area / ratio), MIN_SIDE), wish.max_side))
+        ratio = min(request.aspect, 1 / request.aspect)
+        return int(min(max(math.sqrt(area / ratio), MIN_SIDE), request.max_side))
 
     def get_depth_range(self) -> tuple[float, float]:
-        """The range of depths, from bright to dark."""
+        """Depth range of the colour map, bright to dark; cached."""
         if self._depths is None:
             self._depths = measure_depth_range(self.system, self.orbit[torch.tensor(subsample(len(self.orbit), 3))])
         return self._depths
 
     def reset_depth_range(self) -> None:
-        """Called when the field has changed: the range of depths is out of date."""
+        """Discards the cached depth range, after the field has changed."""
         self._depths = None
 
-    def render(self, wish: ViewRequest, side: int, is_current: Callable[[], bool]) -> UInt8[ndarray, "H W 3"] | None:
-        """A picture of one size; None if it was no longer wanted before it was finished."""
+    def render(self, request: ViewRequest, side: int, is_current: Callable[[], bool]) -> UInt8[ndarray, "H W 3"] | None:
+        """Renders a request at one resolution; None if cancelled by `is_current`."""
         style = FrameStyle(
-            (wish.channel,), wish.background, self.get_depth_range() if wish.channel == "depth" else (0.0, 1.0)
+            (request.channel,), request.background, self.get_depth_range() if request.channel == "depth" else (0.0, 1.0)
         )
-        device, together = self.system.device, CHUNKS_PER_CHECK * self.system.chunk_rays
-        synchronize(device)  # do not count work that is still queued
+        device, batch_size = self.system.device, CHUNKS_PER_CHECK * self.system.chunk_rays
+        synchronize(device)  # exclude queued work from the timing
         began = time.perf_counter()
-        cameras = wish.cameras(side).to(device)
+        cameras = request.cameras(side).to(device)
         rays = cameras.generate_view_rays(0)
         parts = []
-        for start in range(0, len(rays), together):
+        for start in range(0, len(rays), batch_size):
             if not is_current():
                 return None
-            rendered = self.system.render(rays[start : start + together], wish.near, wish.far, wish.background)
-            parts.append(render_channel(rendered, wish.channel, style))
-        picture = to_uint8(torch.cat(parts).view(cameras.height, cameras.width, 3))
+            rendered = self.system.render(
+                rays[start : start + batch_size], request.near, request.far, request.background
+            )
+            parts.append(render_channel(rendered, request.channel, style))
+        image = to_uint8(torch.cat(parts).view(cameras.height, cameras.width, 3))
         self.rays_per_second = 0.5 * self.rays_per_second + 0.5 * len(rays) / max(time.perf_counter() - began, 1e-4)
-        return np.ascontiguousarray(picture)
+        return np.ascontiguousarray(image)

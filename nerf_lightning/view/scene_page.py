@@ -1,4 +1,4 @@
-"""A scene as a page in the browser, served by Viser: cameras with their photos, rays and samples, and what to show."""
+"""Viewer page of a scene: cameras with photos, points, bounds, rays and samples."""
 
 import torch
 
@@ -6,7 +6,7 @@ from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.drawing.style import GREEN, GREY, MAUVE, SKY, VERMILLION, parse_hex_colour
 from nerf_lightning.view.geometry import (
     build_ray_figure,
-    colour_points,
+    color_points,
     compute_box_edges,
     compute_path_segments,
     get_home_viewpoint,
@@ -20,7 +20,7 @@ class ScenePage(Page):
     """Serves a scene until `stop`.
 
     Args:
-        scene: what is shown.
+        scene: the scene to show.
         host, port: see `Page`.
     """
 
@@ -29,7 +29,7 @@ class ScenePage(Page):
         super().__init__(scene.name, get_overview_viewpoint(scene), distance, host, port)
         self.scene = scene
         self.seed = 0
-        """Of the random pixels."""
+        """Seed of the random pixels."""
         with self.server.atomic():
             self.set_up_scene()
             self.add_cameras(scene)
@@ -40,7 +40,7 @@ class ScenePage(Page):
     def _add_geometry(self) -> None:
         scene = self.server.scene
         if self.scene.points is not None:
-            self.points("/points", *colour_points(self.scene.points, self.scene.train), 0.006)
+            self.points("/points", *color_points(self.scene.points, self.scene.train), 0.006)
         self.draw_lines("/orbit", compute_path_segments(self.scene.orbit), parse_hex_colour(MAUVE))
         self.draw_lines("/box", compute_box_edges(self.scene.bounds.aabb), parse_hex_colour(GREY))
         self.points("/focus", self.home.look_at[None], parse_hex_colour(VERMILLION), 0.02)
@@ -68,7 +68,7 @@ class ScenePage(Page):
             button.on_click(lambda _: self.draw_rays(again=True))
 
     def draw_rays(self, again: bool = False) -> None:
-        """Draws the rays that the controls ask for; the same pixels as before unless `again`."""
+        """Draws rays as set by the controls; through new random pixels if `again`."""
         with self.draw_lock, self.server.atomic():
             self.seed += again
             self.ray_group.visible = self.rays.value > 0

@@ -38,6 +38,6 @@ def test_recommend_reports_seed_range_and_collapsed_runs(make_run: MakeRun):
 def test_list_caveats_reports_busy_machine_and_few_seeds(make_run: MakeRun):
     busy = make_run("busy", {"recipe": "x"}, psnr=20.0, load={"own": 1.2, "others": 0.8})
     free = make_run("free", {"recipe": "y"}, psnr=10.0, threads=2, load={"own": 1.0, "others": 0.02})
-    told = list_caveats(compute_points([make_run("calm"), busy, free])[0][1])
-    assert len(told) == 2 and "40%" in told[0] and "of x." in told[0]
-    assert told[1] == "On a frontier with fewer than 3 seeds: grid."
+    caveats = list_caveats(compute_points([make_run("calm"), busy, free])[0][1])
+    assert len(caveats) == 2 and "40%" in caveats[0] and "of x." in caveats[0]
+    assert caveats[1] == "On a frontier with fewer than 3 seeds: grid."

@@ -78,7 +78,7 @@ def test_load_lpips_missing_weights_raises(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setitem(sys.modules, "torchvision", types.ModuleType("torchvision"))
     assert math.isnan(load_lpips()(image, image))
     weights = tmp_path / "checkpoints" / "alexnet-owt-7be5be79.pth"
-    assert f"{weights} is not there" in capsys.readouterr().out
+    assert f"{weights} does not exist" in capsys.readouterr().out
     weights.parent.mkdir()
     weights.touch()
     asked = {}

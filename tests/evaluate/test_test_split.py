@@ -1,4 +1,4 @@
-"""A scene's test split is evaluated beside the held-out views."""
+"""Evaluation of a scene's test split."""
 
 import json
 from dataclasses import replace

@@ -40,7 +40,7 @@ def test_render_channels_are_side_by_side_at_any_scale(run: Path, tmp_path: Path
     assert all((frame[:, 48:, 0] == frame[:, 48:, 1]).all() for frame in frames), "opacity is grey"
 
 
-def test_render_test_path_shows_photos_beside_renders(run: Path, tmp_path: Path):
+def test_render_test_path_shows_photos_and_renders(run: Path, tmp_path: Path):
     render(run, path="test", channels="rgb,depth", output=tmp_path / "test")
     frames = sorted((tmp_path / "test").glob("*.png"))
     assert len(frames) == 2
@@ -55,7 +55,7 @@ def test_render_compact_file_and_the_same_command_reuses_frames(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
     compact, frames = export_compact(run, max_psnr_drop=9), tmp_path / "frames"
-    for there in ("cpu", "2 of them there already"):
+    for there in ("cpu", "2 of them reused"):
         render(compact, frames=2, background="transparent", output=frames)
         assert there in capsys.readouterr().out
     assert imageio.imread(frames / "00001.png").shape == (16, 16, 4)

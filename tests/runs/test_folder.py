@@ -44,7 +44,7 @@ def test_load_config_accepts_shipped_targets(config: dict, tmp_path: Path):
     [
         "os.system",
         "nerf_lightning.utils.files.os.system",  # reachable through the package, but not of it
-        "nerf_lightning.dataset.save_npz",  # of the package, but writes wherever it is told to
+        "nerf_lightning.dataset.save_npz",  # of the package, but writes to any path
         "nerf_lightning.training.sweep.SweepReport",
         ["nerf_lightning.callbacks.Orbit"],
     ],

@@ -58,7 +58,7 @@ def test_choose_candidate_returns_smallest_sufficient(psnrs: tuple, target: Targ
 @pytest.mark.parametrize(
     ("psnrs", "target", "first", "full", "second"),
     [
-        ((20, 27.8, 27.9, 28.0), NEAR, 1, 30.0, 3),  # beside the best
+        ((20, 27.8, 27.9, 28.0), NEAR, 1, 30.0, 3),  # candidate is below the best
         ((20, 25, 28), NEAR, 2, 30.0, None),  # the best itself
         ((25, 26, 27), Target(psnr=28), 2, 28.6, 1),  # 27.6 are expected, which may be wrong by half a dB
         ((25, 26, 27), Target(psnr=28), 2, 27.0, 3),

@@ -65,7 +65,7 @@ def test_rightsize_writes_smallest_run_and_experiment(scene: str, tmp_path: Path
     assert {key: own["model"][key] for key in RUNGS[rung]} == RUNGS[rung]
     assert own["sampler"]["samples"] == found["sampler"]["samples"] and own["dataset"]["path"] == scene
     monkeypatch.setattr(search, "climb_ladder", lambda *_: pytest.fail("climbed again"))
-    assert search_small(scene, psnr=14.0) == found, "a finished search is only told again"
+    assert search_small(scene, psnr=14.0) == found, "a finished search is only reported again"
     with pytest.raises(InputError, match="holds something else"):
         search_small(scene, psnr=15.0)
 

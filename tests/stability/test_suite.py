@@ -113,7 +113,7 @@ def test_judge_compares_a_seed_with_its_own_clean_run():
 
 
 def test_find_rescues_compares_recovery_twin_with_clean_runs():
-    without = replace(GOOD, method="relu mlp, no guard")
+    without = replace(GOOD, method="relu mlp, no recovery")
     guarded = replace(GOOD, method="relu mlp", recoveries=1)
     lost = replace(without, psnr=12.0, status="collapsed")
     results = [replace(without, seed=0, psnr=30.0), replace(lost, seed=1), replace(lost, seed=2)]
@@ -122,7 +122,7 @@ def test_find_rescues_compares_recovery_twin_with_clean_runs():
     rescues = find_rescues(results)
     assert rescues == [True, False, True]
     lines = summarize(judge(results), rescues)
-    assert "clean, relu mlp, no guard (2/3 failed); rate x30, relu mlp, no guard (1/1 failed)" in lines[0]
+    assert "clean, relu mlp, no recovery (2/3 failed); rate x30, relu mlp, no recovery (1/1 failed)" in lines[0]
     assert "2 of 3" in lines[1]
     assert "proves nothing" in summarize(judge(results[:1]), [])[0]
 

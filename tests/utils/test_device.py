@@ -1,4 +1,4 @@
-"""Which device a run or a verb takes: told early where it is not there, and with its own limits."""
+"""Device selection of runs and commands: early errors, and limits per device."""
 
 import json
 import shutil
@@ -57,7 +57,7 @@ def test_resolve_device_auto_is_best_available(monkeypatch: pytest.MonkeyPatch, 
     assert resolve_device("auto") == resolve_device("mps") == torch.device("mps")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     assert resolve_device("auto") == torch.device("cuda") and resolve_device("cpu") == CPU
-    with pytest.raises(InputError, match="found 'gpu', expected auto, or what is there: cuda, mps, cpu"):
+    with pytest.raises(InputError, match="found 'gpu', expected auto, or an available device: cuda, mps, cpu"):
         resolve_device("gpu")
 
 

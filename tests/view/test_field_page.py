@@ -30,7 +30,7 @@ def orbit() -> Cameras:
     return Cameras.pinhole(K.repeat(4, 1, 1), make_circle_poses(CENTRE, UP, 3.0, 0.3, 4), 32, 24)
 
 
-def wish(**changes: Any) -> ViewRequest:
+def make_request(**changes: Any) -> ViewRequest:
     c2w = look_at(CENTRE + torch.tensor([3.0, 0, 0]), CENTRE, UP).double().numpy()
     given = {"c2w": c2w, "fov": 0.8, "aspect": 1.5, "channel": "rgb", "background": BLUE, "near": 0.0, "far": math.inf}
     return ViewRequest(**{**given, "max_side": 60, **changes})
@@ -42,16 +42,16 @@ def painter() -> ProgressiveRenderer:
 
 
 def test_progressive_renderer_matches_system(painter: ProgressiveRenderer):
-    picture = painter.render(wish(), 60, lambda: True)
+    picture = painter.render(make_request(), 60, lambda: True)
     assert picture is not None and picture.shape == (40, 60, 3)
-    cameras = wish().cameras(60)
+    cameras = make_request().cameras(60)
     assert (cameras.width, cameras.height) == (60, 40)
     expected = painter.system.render(cameras.generate_view_rays(0), background=BLUE).rgb.view(40, 60, 3).numpy()
     assert np.abs(picture / 255 - expected).max() <= 0.5 / 255 + 1e-6
     assert picture[0, 0].tolist() == [0, 0, 255]
     # A ball of radius r at distance d covers a circle of the radius f r / sqrt(d^2 - r^2).
     focal = 20 / math.tan(0.4)
-    opacity = painter.render(wish(channel="opacity", background=(0.0, 0.0, 0.0)), 60, lambda: True)
+    opacity = painter.render(make_request(channel="opacity", background=(0.0, 0.0, 0.0)), 60, lambda: True)
     assert opacity is not None
     covered = math.sqrt(float((opacity[..., 0] / 255.0).sum()) / math.pi)
     assert covered == pytest.approx(focal * RADIUS / math.sqrt(9 - RADIUS**2), rel=0.08)
@@ -59,7 +59,7 @@ def test_progressive_renderer_matches_system(painter: ProgressiveRenderer):
 
 def test_progressive_renderer_near_and_far_clip(painter: ProgressiveRenderer):
     whole, behind, before = (
-        painter.render(wish(channel="depth", background=(0.0, 0.0, 0.0), **cut), 60, lambda: True)
+        painter.render(make_request(channel="depth", background=(0.0, 0.0, 0.0), **cut), 60, lambda: True)
         for cut in ({}, {"near": 3.0}, {"far": 3.0 - RADIUS - 0.2})
     )
     assert whole is not None and behind is not None and before is not None
@@ -72,7 +72,7 @@ class Browser(viser.ClientHandle):
 
     def __init__(self) -> None:
         self.client_id = 7
-        c2w = wish().c2w
+        c2w = make_request().c2w
         self.pictures: list[np.ndarray] = []
         self.camera = SimpleNamespace(
             wxyz=SO3.from_matrix(c2w[:3, :3]).wxyz,
@@ -123,11 +123,11 @@ SMALL = ["+experiment=smoke_3d", "dataset.size=16", "budget.steps=12", "callback
 
 
 def test_live_shows_progress_and_does_not_change_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    browser, told = Browser(), []
+    browser, reports = Browser(), []
     show = FieldPage.show_progress
 
     def with_browser(self: FieldPage, share: float, words: str) -> None:
-        told.append((share, words))
+        reports.append((share, words))
         show(self, share, words)
         if "done" in words:  # the browser gets one more image, and closes the page
             browser.scene.set_background_image = lambda *args, **given: self._remove_client(browser)
@@ -147,8 +147,8 @@ def test_live_shows_progress_and_does_not_change_training(tmp_path: Path, monkey
         )
     )
     assert browser.pictures
-    assert 0 < told[0][0] < 1 and told[0][1].startswith("step ")
-    assert told[-1][0] == 1 and "training is done: held out" in told[-1][1]
+    assert 0 < reports[0][0] < 1 and reports[0][1].startswith("step ")
+    assert reports[-1][0] == 1 and "training is done: held out" in reports[-1][1]
     train(compose_config(SMALL, tmp_path / "alone"))
     live, alone = (load_run(tmp_path / name).system.state_dict() for name in ("live", "alone"))
     assert all(torch.equal(live[key], alone[key]) for key in alone)

@@ -17,7 +17,7 @@ import torch
 from nerf_lightning.cli.view import has_run, view
 from nerf_lightning.dataset import Scene, Views, save_npz
 from nerf_lightning.errors import InputError
-from nerf_lightning.view.geometry import colour_points
+from nerf_lightning.view.geometry import color_points
 from nerf_lightning.view.scene_page import ScenePage
 from nerf_lightning.view.serve import announce, resolve_host
 
@@ -74,14 +74,14 @@ def test_scene_page_controls_change_what_is_shown(page: ScenePage):
     assert nodes("/training/0").image is None
 
 
-def test_colour_points_use_nearest_photo(scene: Scene):
+def test_color_points_use_nearest_photo(scene: Scene):
     images = torch.zeros(4, 16, 16, 3, dtype=torch.uint8)
     images[:] = torch.tensor([10, 20, 30, 40])[:, None, None, None]
     views = Views.from_images(images, scene.train.cameras)
     c2w = scene.train.cameras.c2w
     near = c2w[2, :3, 3] + 0.5 * c2w[2, :3, 2]
     behind = scene.train.cameras.centres.mean(0) + 1e3 * torch.tensor([0.0, 0.0, 1.0])
-    points, rgb = colour_points(torch.stack([near, behind]), views)
+    points, rgb = color_points(torch.stack([near, behind]), views)
     np.testing.assert_allclose(points[0], near)
     assert rgb.tolist() == [[30] * 3, [128] * 3]
 
