@@ -35,8 +35,8 @@ suite: $(VENV)/.test
 long: $(VENV)/.test         ## what a test run leaves out: launchers of sweeps, kernels of a compiler, the notebook, whole runs on a pretended device
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m long
 
-QUICK := $(wildcard tests/test_rooms.py tests/test_line_budget.py $(addprefix tests/, cameras sampler renderer cli/test_app.py dataset/test_rays.py dataset/test_npz.py) \
-	tests/runs/test_folder.py $(addprefix tests/config/test_, defaults.py rates.py resolvers.py))
+QUICK := $(wildcard tests/test_import_layers.py tests/test_line_budget.py $(addprefix tests/, cameras sampler renderer cli/test_app.py dataset/test_rays.py dataset/test_npz.py) \
+	tests/runs/test_folder.py $(addprefix tests/config/test_, defaults.py learning_rates.py resolvers.py))
 
 quick: $(VENV)/.test        ## what a change most likely breaks, in half a minute
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses=4 --dist worksteal $(QUICK)

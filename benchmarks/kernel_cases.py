@@ -1,4 +1,4 @@
-"""The kernels' work in one training step: what they are called with, and which of that gets a gradient."""
+"""Kernel cases: the kernels' inputs in one training step, and which of them get gradients."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,47 +16,47 @@ from nerf_lightning.model.hashgrid import cubic_cells
 
 NUM_SAMPLES, NUM_RAYS = 1 << 15, 1 << 12
 MAX_STEPS, GRID_RESOLUTION = 192, 64
-"""Steps along a ray at most, and cells along a side of the occupancy grid."""
+"""Most ray marching steps, and cells along a side of the occupancy grid."""
 MIN_TRANSMITTANCE, MIN_THICKNESS, MIN_SAMPLE_WEIGHT = 1e-4, 5e-3, 1e-2
 MIN_KINK_DISTANCE = 1e-5
-"""Distance from zero that counts as near for a rectifier."""
+"""Least distance of a ReLU's input from zero, so that rounding cannot flip its gradient."""
 PRUNED_FRACTION = 1 / 3
-"""Share of the voxels' vertices that are not kept."""
+"""Fraction of the voxel vertices that are pruned."""
 
 Outputs = Sequence[Tensor]
 
 
 @dataclass(frozen=True)
 class Case:
-    """A kernel as a training calls it; which version runs is for `set_kernels` and the inputs' device to say."""
+    """A kernel call of a training; `set_kernels` and the inputs' device select the version."""
 
     call: Callable[..., Tensor | Outputs]
     inputs: tuple[Tensor, ...]
     """On the CPU."""
     num_trainable: int = 0
-    """How many of the inputs, from the first, get a gradient."""
+    """Number of leading inputs that get gradients."""
     kind: str = "dense"
-    """What comes out: "dense" tensors of one size; "packed" samples, however many; "rows" rows and their weights."""
+    """Kind of the outputs: "dense" tensors, "packed" samples of varying number, or "rows" and their weights."""
 
     def to_device(self, device: torch.device) -> tuple[Tensor, ...]:
-        """Fresh inputs there, those that learn as leaves."""
+        """Copies the inputs to a device, the trainable ones as leaves."""
         copies = [x.detach().to(device, copy=True) for x in self.inputs]
         return tuple(x.requires_grad_() if number < self.num_trainable else x for number, x in enumerate(copies))
 
     def outputs(self, inputs: tuple[Tensor, ...]) -> list[Tensor]:
-        """What comes out, as a list."""
+        """Calls the kernel and returns its outputs as a list."""
         out = self.call(*inputs)
         return [out] if isinstance(out, Tensor) else list(out)
 
-    def gradients(self, inputs: tuple[Tensor, ...], outputs: list[Tensor], above: list[Tensor]) -> list[Tensor]:
-        """Those of the inputs that learn, `above` being what the outputs' are; none where none does."""
-        learning = inputs[: self.num_trainable]
-        return list(torch.autograd.grad(outputs, learning, above)) if learning else []
+    def gradients(self, inputs: tuple[Tensor, ...], outputs: list[Tensor], grads: list[Tensor]) -> list[Tensor]:
+        """Gradients of the trainable inputs, given those of the outputs."""
+        trainable = inputs[: self.num_trainable]
+        return list(torch.autograd.grad(outputs, trainable, grads)) if trainable else []
 
 
 @contextmanager
 def kernel_version(choice: str) -> Iterator[None]:
-    """What `set_kernels` says, for a while."""
+    """Selects the kernels' version within a block."""
     kernels.set_kernels(choice)
     try:
         yield
@@ -86,14 +86,14 @@ def mark_cells(marks: Tensor, aabb: Tensor, positions: Tensor) -> Tensor:
     return marks
 
 
-def mark_rows(seen: Tensor, rows: Tensor) -> Tensor:
-    seen = seen.clone()
-    kernels.mark_rows(seen, rows, 3)
-    return seen
+def mark_rows(last_seen: Tensor, rows: Tensor) -> Tensor:
+    last_seen = last_seen.clone()
+    kernels.mark_rows(last_seen, rows, 3)
+    return last_seen
 
 
 def mlp(x: Tensor, *rest: Tensor) -> Tensor:
-    """The layers' matrices and biases in turn, then the extra inputs."""
+    """MLP whose weights and biases alternate in `rest`, followed by the extra inputs."""
     *flat, extra = rest
     return kernels.mlp(x, list(zip(flat[::2], flat[1::2], strict=True)), extra)
 
@@ -112,18 +112,18 @@ def hash_interpolate(cells: Sequence[tuple[int, ...]], sizes: list[int], tables:
 
 
 def make_converging_rays(unbounded: bool) -> tuple[Tensor, ...]:
-    """Rays from a sphere of radius 4 toward the middle of a box, the box, where rays begin and end, their shifts, and a ball
-    of occupied cells: what `march` takes."""
+    """Inputs of `march`: rays from a sphere of radius 4 toward the centre of a box, the box, near, far, jitter, and a ball
+    of occupied cells."""
     origins = 4 * normalize(torch.randn(NUM_RAYS, 3), dim=1)
     directions = normalize(0.5 * torch.randn(NUM_RAYS, 3) - origins, dim=1)
     axis = (torch.arange(GRID_RESOLUTION) + 0.5) / (GRID_RESOLUTION / 2) - 1
-    ball = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2 < 0.1).flatten()
+    occupied = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2 < 0.1).flatten()
     box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded)
-    return origins, directions, box.aabb, *box.near_far(Rays(origins, directions)), torch.rand(NUM_RAYS), ball
+    return origins, directions, box.aabb, *box.near_far(Rays(origins, directions)), torch.rand(NUM_RAYS), occupied
 
 
 def sparsify(field: VoxelField) -> None:
-    """Leaves out some of a field's vertices, and gives the others something to tell."""
+    """Prunes random vertices of a voxel field and randomizes the others."""
     keep = torch.rand(len(field.index)) > PRUNED_FRACTION
     rows = 1 + int(keep.sum())
     field.set_vertices(keep, [torch.randn(rows, *table.shape[1:]) for table in field.tables])
@@ -131,17 +131,17 @@ def sparsify(field: VoxelField) -> None:
 
 @torch.no_grad()
 def avoid_kinks(x: Tensor, extra: Tensor, layers: Sequence[torch.nn.Linear]) -> Tensor:
-    """Rows of inputs at which no rectifier is so near to where it opens that rounding decides whether a gradient passes."""
+    """Rows of inputs for which no ReLU is so close to its kink that rounding decides the gradient."""
     h, clear = torch.cat([x, extra], dim=1), torch.ones(len(x), dtype=torch.bool)
     for layer in layers[:-1]:
-        before = layer(h)
-        clear &= (before.abs() > MIN_KINK_DISTANCE).all(1)
-        h = torch.relu(before)
+        preactivation = layer(h)
+        clear &= (preactivation.abs() > MIN_KINK_DISTANCE).all(1)
+        h = torch.relu(preactivation)
     return clear.nonzero()[:, 0]
 
 
 def make_cases(choice: str = "reference") -> dict[str, Case]:
-    """All kernels by name; what some take from others is laid out in memory as that version leaves it."""
+    """Makes the cases of all kernels, by name; intermediate inputs have the memory layout of the chosen version."""
     with kernel_version(choice):
         return _make_cases()
 
@@ -152,13 +152,13 @@ def _make_cases() -> dict[str, Case]:
     origins, directions, aabb = bounded[:3]
     packed = tuple(march(False, None, *bounded))
     t, dt, ray, _ = packed
-    capacity = 5 * len(t) // 4  # as samplers leave where nobody waits to count
-    roomy = tuple(march(False, capacity, *bounded))
-    density = 100 * torch.rand(len(t)) ** 3  # some hold nothing, and some end their ray
+    capacity = 5 * len(t) // 4  # as samplers choose it to avoid a host sync
+    packed_into_capacity = tuple(march(False, capacity, *bounded))
+    density = 100 * torch.rand(len(t)) ** 3  # some transparent, some opaque
     rgb = torch.rand(3, len(t)).T
     unit = Bounds(aabb).to_unit(kernels.ray_positions(origins, directions, ray, t))[:NUM_SAMPLES]
-    seen_from = directions[ray][:NUM_SAMPLES]
-    harmonics = kernels.spherical_harmonics(seen_from)
+    view_directions = directions[ray][:NUM_SAMPLES]
+    harmonics = kernels.spherical_harmonics(view_directions)
     grid, picture = HashGrid(cubic_cells(8, 16, 256), 17, 2), HashGrid2DField((512, 512)).grid
     layers = [torch.nn.Linear(i, o) for i, o in ((31, 32), (32, 32), (32, 3))]
     flat = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
@@ -177,7 +177,7 @@ def _make_cases() -> dict[str, Case]:
         "filter_visible": Case(partial(filter_visible, None), (density * packed[1], *packed), kind="packed"),
         "filter_visible, into capacity": Case(
             partial(filter_visible, capacity),
-            (density[torch.arange(capacity) % len(t)] * roomy[1], *roomy),
+            (density[torch.arange(capacity) % len(t)] * packed_into_capacity[1], *packed_into_capacity),
             kind="packed",
         ),
         "merge_low_weight": Case(merge_low_weight, (density * packed[1], *packed), kind="packed"),
@@ -191,7 +191,7 @@ def _make_cases() -> dict[str, Case]:
             num_trainable=1,
         ),
         "mlp": Case(mlp, (features.T[:, clear].T, *flat, harmonics.T[:, clear].T), num_trainable=1 + len(flat)),
-        "spherical_harmonics": Case(kernels.spherical_harmonics, (seen_from,)),
+        "spherical_harmonics": Case(kernels.spherical_harmonics, (view_directions,)),
         "plane_line_products": Case(
             kernels.plane_line_products, (factors.planes, factors.lines, unit), num_trainable=2
         ),

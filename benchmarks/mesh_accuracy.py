@@ -1,4 +1,4 @@
-"""Shapes: meshes of trained fields against the surfaces that were photographed."""
+"""Mesh accuracy: meshes of trained fields against the true surfaces."""
 
 import argparse
 import io
@@ -25,20 +25,20 @@ from nerf_lightning.synthetic.solids import load_bulldozer
 from nerf_lightning.utils.device import resolve_device
 
 PHOTOS, VIEWS = 20, 40
-"""Of the sheet, and of the object."""
+"""Photos of the sheet, and of the object."""
 MIN_HEIGHT_M = 0.005
-"""Metres above the table from which on the object alone is looked at: a few voxels above the paper."""
+"""Height above the table from which on only the object is measured: a few voxels above the paper."""
 MAX_PHOTO_SIDE = 800
-"""Pixels of the photos' longer side, of 1024: a mesh is as fine as they are."""
+"""Longest side of the photos, of 1024 pixels: it limits the mesh's resolution."""
 CAPTURE_TIME_FACTOR = 3
-"""Times the seconds that a capture is trained for, where every ray hits something."""
+"""Training time of the capture relative to bricks: all of its rays hit something."""
 
 
 def compute_bricks_distance(points: np.ndarray) -> np.ndarray:
-    """Signed distance [N] of points [N, 3] to the built-in scene's solids, negative inside: exact outside of all, and inside
-    at most the depth in the one that a point lies deepest in."""
+    """Signed distance [N] of points [N, 3] to the solids of the built-in scene, negative inside; exact outside all solids,
+    inside a bound."""
     solids = load_bulldozer()
-    least = np.full(len(points), np.inf)
+    distance = np.full(len(points), np.inf)
     for index in range(len(solids.centre)):
         local, half = (points - solids.centre[index]) @ solids.axes[index].T, solids.half_size[index]
         if solids.is_cylinder[index]:
@@ -46,12 +46,12 @@ def compute_bricks_distance(points: np.ndarray) -> np.ndarray:
         else:
             beyond = np.abs(local) - half
         outside, inside = np.linalg.norm(beyond.clip(0), axis=1), beyond.max(1).clip(max=0)
-        least = np.minimum(least, outside + inside)
-    return least
+        distance = np.minimum(distance, outside + inside)
+    return distance
 
 
 def extract_mesh(run: LoadedSceneRun, box: torch.Tensor | None = None) -> tuple[trimesh.Trimesh, float]:
-    """A run's mesh, read back from its file, and the side of a voxel in the same unit."""
+    """Extracts a run's mesh through its file format; also the side of a voxel, in the same unit."""
     volume = sample_volume(run, box=box)
     content = build_mesh_file(run, select_training_views(run), volume, None, ".ply").content
     mesh: Any = trimesh.load(io.BytesIO(content), file_type="ply")
@@ -59,44 +59,44 @@ def extract_mesh(run: LoadedSceneRun, box: torch.Tensor | None = None) -> tuple[
 
 
 def measure_bricks(seconds: float, output: Path) -> Rows:
-    """How far the vertices of a mesh are from the built-in scene's surface, in voxels.
+    """Measures the distance of mesh vertices to the surface of the built-in scene, in voxels.
 
-    A random background teaches a field the outlines too: before a black one dark things need no density.
+    Trained on a random background: on a black one dark surfaces need no density.
     """
     rows: Rows = []
     for recipe in ("tensorf_medium", "voxels_medium", "hashgrid_medium"):
         folder = output / "shapes" / recipe
-        given = ["dataset=bricks", f"recipe={recipe}", f"budget.seconds={seconds}", "renderer.background=random"]
-        trained = train("lego", given, 0, folder)
+        options = ["dataset=bricks", f"recipe={recipe}", f"budget.seconds={seconds}", "renderer.background=random"]
+        trained = train("lego", options, 0, folder)
         mesh, voxel = extract_mesh(open_scene_run(folder, resolve_device("auto")))
-        off = np.abs(compute_bricks_distance(np.asarray(mesh.vertices))) / voxel
+        distance = np.abs(compute_bricks_distance(np.asarray(mesh.vertices))) / voxel
         row = {"field": recipe, "psnr": trained["psnr"], "voxel": voxel}
-        row |= {f"p{share}_voxels": float(np.percentile(off, share)) for share in (50, 95, 99)}
+        row |= {f"p{share}_voxels": float(np.percentile(distance, share)) for share in (50, 95, 99)}
         rows.append({**row, "watertight": mesh.is_watertight, "triangles": len(mesh.faces)})
     return rows
 
 
 def get_true_box(table: Tabletop) -> np.ndarray:
-    """Corners [2, 3] of what of the object reaches higher than `MIN_HEIGHT_M`, metres in the layout's frame."""
+    """Bounding box [2, 3] of the object's part above `MIN_HEIGHT_M`, metres in the layout's frame."""
     solids = load_bulldozer()
-    reach = np.abs(solids.axes * solids.half_size[:, :, None]).sum(1)
-    corners = table.shift + table.scale * (solids.centre + np.stack([-reach, reach]))
+    extent = np.abs(solids.axes * solids.half_size[:, :, None]).sum(1)
+    corners = table.shift + table.scale * (solids.centre + np.stack([-extent, extent]))
     high_enough = corners[:, corners[1, :, 2] > MIN_HEIGHT_M]
     return np.stack([high_enough[0].min(0), high_enough[1].max(0)])
 
 
 def measure_object_size(run: LoadedSceneRun, solution: PoseSolution, layout: TagLayout) -> Rows:
-    """How large the object is in the mesh of a capture's run, beside its true size.
+    """Compares the object's size in the mesh of a capture with its true size.
 
     Args:
-        run: of the capture's scene.
-        solved: its poses, in the frame of the tag that the solver took for home.
-        layout: of the tags, in whose frame the truth is known.
+        run: trained on the capture's scene.
+        solution: the capture's poses, in the frame of the reference tag.
+        layout: true layout of the tags.
     """
     low, high = get_true_box(Tabletop(layout))
     to_truth = torch.from_numpy(solve_home_frame(solution, layout)).double()
-    room = 0.2 * (high - low)
-    box = torch.from_numpy(np.stack([low - room, high + room])).float()
+    margin = 0.2 * (high - low)
+    box = torch.from_numpy(np.stack([low - margin, high + margin])).float()
     box[0, 2] = MIN_HEIGHT_M
     mesh, voxel = extract_mesh(replace(run, to_source=to_truth @ run.to_source), box)
     largest = max(mesh.split(only_watertight=False), key=lambda part: len(part.faces))
@@ -111,20 +111,20 @@ def measure_object_size(run: LoadedSceneRun, solution: PoseSolution, layout: Tag
 
 
 def measure_capture(seconds: float, output: Path) -> Rows:
-    """The same for a synthetic capture."""
+    """Trains on a synthetic capture and measures the object's size in its mesh."""
     folder = output / "shapes" / "capture"
     layout = SHEETS["six tags"]
     write_capture(folder, layout, LENS, PHOTOS, VIEWS, CAMERA_FLAWS, 0)
-    found = capture_scene(
+    capture = capture_scene(
         folder / "calibration", folder / "photos", TAG_SIZE, folder / "scene.npz", max_side=MAX_PHOTO_SIDE
     )
-    given = [f"dataset.path='{folder}/scene.npz'", f"budget.seconds={CAPTURE_TIME_FACTOR * seconds}"]
-    trained = train("capture", given, 0, folder / "run")
-    rows = measure_object_size(open_scene_run(folder / "run", resolve_device("auto")), found.solution, layout)
+    options = [f"dataset.path='{folder}/scene.npz'", f"budget.seconds={CAPTURE_TIME_FACTOR * seconds}"]
+    trained = train("capture", options, 0, folder / "run")
+    rows = measure_object_size(open_scene_run(folder / "run", resolve_device("auto")), capture.solution, layout)
     return [{**row, "psnr": trained["psnr"]} for row in rows]
 
 
 def measure(args: argparse.Namespace) -> Rows:
-    """Both tables."""
+    """Measures both tables."""
     seconds, output = args.budgets[0], args.output
     return name_tables({"shapes": measure_bricks(seconds, output), "capture shapes": measure_capture(seconds, output)})

@@ -1,4 +1,4 @@
-"""Methods side by side: each is trained as a user would train it, in a process of its own, one after the other."""
+"""Method comparison: PSNR over training time, each run in a separate process, as a user would train it."""
 
 import argparse
 import itertools
@@ -12,47 +12,47 @@ from typing import Any
 from benchmarks.tables import Row, Rows
 
 METHODS = ("tensorf", "hashgrid", "voxels", "mlp")
-"""In 3D; the recipe of each in its usual size ends in _medium."""
+"""3D methods; NAME_medium is the recipe of each in its default size."""
 TARGETS_DB = (24, 27, 30)
 REPORT_SECONDS = (10, 30, 60, 300)
 CHECK_SECONDS = (0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 100, 120, 150, 180, 240)
-"""Seconds of training after which a run is measured, where its budget is longer."""
+"""Seconds of training at which a run is validated, up to its budget."""
 
 Run = dict[str, Any]
 
 
 def format_fractions(seconds: float) -> str:
-    """Shares of a budget at which a run is measured."""
+    """Fractions of a budget at which a run is validated, comma-separated."""
     return ",".join(str(check / seconds) for check in CHECK_SECONDS if check < seconds)
 
 
-def train(experiment: str, overrides: list[str], seed: int, folder: Path, measured_at: str = "") -> Run:
-    """One run; returns its results.json."""
+def train(experiment: str, overrides: list[str], seed: int, folder: Path, validation_fractions: str = "") -> Run:
+    """Trains in a subprocess; returns the content of results.json."""
     command = [sys.executable, "-m", "nerf_lightning", f"+experiment={experiment}", *overrides]
-    command += [f"seed={seed}", f"callbacks.validation.fractions=[{measured_at}]"]
+    command += [f"seed={seed}", f"callbacks.validation.fractions=[{validation_fractions}]"]
     command += ["callbacks.snapshots.steps=[]", "callbacks.orbit=null", f"hydra.run.dir='{folder}'"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SystemExit(f"benchmarks: {experiment} failed: {done.stderr.strip().splitlines()[-1:]}")
+    completed = subprocess.run(command, capture_output=True, text=True, check=False)
+    if completed.returncode:
+        raise SystemExit(f"benchmarks: {experiment} failed: {completed.stderr.strip().splitlines()[-1:]}")
     return json.loads((folder / "results.json").read_text(encoding="utf-8"))
 
 
 def find_seconds_to_psnr(curve: list[list[float]], target: float) -> float | None:
-    """Training seconds at which the curve [[seconds, step, dB], ...] first stands at the target."""
+    """Training seconds at which the curve [[seconds, step, dB], ...] first reaches the target."""
     return next((seconds for seconds, _, quality in curve if quality >= target), None)
 
 
 def censored_median(values: list[float | None]) -> float | None:
-    """The median; None where more than half of the values are missing (they count as infinitely large)."""
-    known = median(float("inf") if value is None else value for value in values)
-    return None if known == float("inf") else known
+    """Median with missing values as infinity; None if the median is missing."""
+    middle = median(float("inf") if value is None else value for value in values)
+    return None if middle == float("inf") else middle
 
 
 def summarize(method: str, by_budget: dict[float, list[Run]]) -> Row:
-    """One line of the table: medians over seeds.
+    """Summarizes a method's runs in one row, medians over seeds.
 
-    Seconds to a quality come from the budget that gets there first; dB at a moment from the shortest budget that lasts so
-    long, since a run anneals its learning rate toward the end of its budget.
+    Seconds to a PSNR come from the fastest budget; dB after some seconds from the shortest budget that lasts so long, since
+    the learning rate anneals toward the end of the budget.
     """
     row: Row = {"method": method, "seeds": min(len(runs) for runs in by_budget.values())}
     for target in TARGETS_DB:
@@ -78,15 +78,15 @@ def summarize(method: str, by_budget: dict[float, list[Run]]) -> Row:
 
 
 def measure(args: argparse.Namespace) -> Rows:
-    """A line an experiment, trained with every budget and seed."""
+    """Trains each experiment with every budget and seed; one row per experiment."""
     rows: Rows = []
     for experiment in args.experiments:
         by_budget: dict[float, list[Run]] = {}
         for seconds, seed in itertools.product(args.budgets, args.seeds):
-            given = [*args.overrides, f"device={args.device.type}", f"budget.seconds={seconds}"]
-            place = args.output / f"{experiment}_{seconds:g}s_seed{seed}"
+            options = [*args.overrides, f"device={args.device.type}", f"budget.seconds={seconds}"]
+            folder = args.output / f"{experiment}_{seconds:g}s_seed{seed}"
             try:
-                run = train(experiment, given, seed, place, format_fractions(seconds))
+                run = train(experiment, options, seed, folder, format_fractions(seconds))
             except SystemExit as failure:
                 rows.append({"method": experiment, "differs": str(failure)})
                 break

@@ -1,4 +1,4 @@
-"""What a piece of work asks of a device: operations, each a launch, and waits of the host for it."""
+"""Counts a device's operations, each a kernel launch, and the host's waits for it (syncs)."""
 
 from collections import Counter
 from typing import Any
@@ -9,20 +9,20 @@ from torch.utils import _pytree as pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 SYNC_OPS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::equal", "aten::_unique2")
-"""Operations whose answer, or whose answer's size, the host has to know before it can go on."""
+"""Operations whose result, or its size, the host needs before it can continue."""
 INDEX_OPS = ("aten::index", "aten::index_put", "aten::index_put_", "aten::_index_put_impl_")
-"""Operations that look for the true entries of a mask where they are given one."""
+"""Operations that sync if indexed by a mask."""
 
 FREE_OPS = {f"aten::{name}" for name in ("detach", "_unsafe_view", "empty", "empty_like", "empty_strided", "new_empty")}
-"""Operations, beside views, that launch nothing."""
+"""Operations, other than views, that launch nothing."""
 
 
 def is_sync(name: str, args: Any, kwargs: Any) -> bool:
-    """Whether the host waits for a device in an operation.
+    """True if an operation makes the host wait for the device.
 
     Args:
-        name: of the operation, without that of its overload.
-        args, kwargs: what it is given.
+        name: of the operation, without its overload.
+        args, kwargs: of the call.
     """
     if name in SYNC_OPS:
         return True
@@ -35,12 +35,12 @@ def is_sync(name: str, args: Any, kwargs: Any) -> bool:
 
 
 class OpCounter(TorchDispatchMode):
-    """Counts what is asked of the dispatcher inside `with Count() as count:`, autograd's work too."""
+    """Counts dispatched operations within `with OpCounter() as count:`, autograd's included."""
 
     def __init__(self) -> None:
         super().__init__()
         self.names: Counter[str] = Counter()
-        """Operations that work on a device."""
+        """Counts of the operations that launch work."""
         self.waits = 0
 
     @property

@@ -1,4 +1,4 @@
-"""Photos as people have them: several sizes, passers-by with and without masks, a fisheye; against plain ones."""
+"""Photo robustness: mixed sizes, occluders with and without masks, and a fisheye lens, against clean photos."""
 
 import argparse
 import math
@@ -24,19 +24,19 @@ SIZE, VIEWS, HELD_OUT = 128, 48, 6
 STEPS = 1500
 GREY = (0.5, 0.5, 0.5)
 BOXED_FRACTION = 0.3
-"""Share of the training photos that have boxes pasted on."""
+"""Fraction of the training photos with pasted boxes."""
 FISHEYE = Distortion(k1=-0.02, k2=0.004)
 DISABLED_OUTPUTS = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger", "callbacks.validation=null")
 
 
 def concatenate_views(parts: Sequence[Views]) -> Views:
-    """Views of several sizes, one after the other."""
+    """Concatenates views of different sizes."""
     K, c2w, sizes = (torch.cat([getattr(part.cameras, name) for part in parts]) for name in ("K", "c2w", "sizes"))
     return Views(torch.cat([part.pixels for part in parts]), Cameras(K, c2w, sizes))
 
 
 def crop_views(views: Views, left: int, top: int) -> Views:
-    """Photos without margins of so many pixels on either side."""
+    """Crops photos by margins in pixels on both sides."""
     cameras = views.cameras
     K = cameras.K.clone()
     K[:, 0, 2] -= left
@@ -47,7 +47,7 @@ def crop_views(views: Views, left: int, top: int) -> Views:
 
 
 def resize_views(scene: Scene) -> Scene:
-    """A third of the training photos is landscape, a third portrait, a third halved in size."""
+    """Makes a third of the training photos landscape, a third portrait, and a third half as large."""
     train = scene.train
     thirds = [train[torch.arange(first, len(train), 3)] for first in range(3)]
     small = thirds[2].cameras.rescale(0.5)
@@ -59,36 +59,36 @@ def resize_views(scene: Scene) -> Scene:
 
 
 def paste_boxes(scene: Scene, seed: int) -> tuple[Scene, Scene]:
-    """Random boxes pasted over some training photos; and the same with masks of them."""
+    """Pastes random boxes over some training photos; returns the scene without and with their masks."""
     generator = torch.Generator().manual_seed(seed)
     images = scene.train.images.clone()
-    known = torch.ones(images.shape[:3], dtype=torch.bool)
+    valid = torch.ones(images.shape[:3], dtype=torch.bool)
     for view in torch.randperm(len(images), generator=generator)[: round(BOXED_FRACTION * len(images))].tolist():
         for _ in range(3):
             top, left = torch.randint(SIZE, (2,), generator=generator).tolist()
             height, width = torch.randint(SIZE // 5, SIZE // 2, (2,), generator=generator).tolist()
-            place = slice(top, top + height), slice(left, left + width)
-            images[view][place] = torch.randint(256, (3,), generator=generator).to(torch.uint8)
-            known[view][place] = False
-    spoiled = Views.from_images(images, scene.train.cameras)
-    masked = replace(spoiled, valid_mask=known.flatten())
-    return replace(scene, train=spoiled), replace(scene, train=masked)
+            box = slice(top, top + height), slice(left, left + width)
+            images[view][box] = torch.randint(256, (3,), generator=generator).to(torch.uint8)
+            valid[view][box] = False
+    occluded = Views.from_images(images, scene.train.cameras)
+    masked = replace(occluded, valid_mask=valid.flatten())
+    return replace(scene, train=occluded), replace(scene, train=masked)
 
 
 def render_fisheye(views: int, phase: float) -> Views:
-    """Photos of the same field of view as those of `around`, through a fisheye."""
-    straight = make_hemisphere_cameras(views, SIZE, phase)
-    K = straight.K.clone()
+    """Renders fisheye photos with the field of view of `make_hemisphere_cameras`."""
+    pinhole = make_hemisphere_cameras(views, SIZE, phase)
+    K = pinhole.K.clone()
     half = math.atan(float(0.5 * SIZE / K[0, 0, 0]))
     focal = 0.5 * SIZE / (half * (1 + FISHEYE.k1 * half**2 + FISHEYE.k2 * half**4))
     K[:, 0, 0] = K[:, 1, 1] = focal
     lenses = Lenses(torch.tensor([FISHEYE]).repeat(views, 1), torch.full((views,), Projection.FISHEYE))
-    cameras = Cameras(K, straight.c2w, straight.sizes, lenses)
+    cameras = Cameras(K, pinhole.c2w, pinhole.sizes, lenses)
     return Views.from_images(render_photos(PILE, cameras, GREY), cameras)
 
 
 def measure(args: argparse.Namespace) -> Rows:
-    """The table, a line a kind of photos."""
+    """Trains on each kind of photos; one row per kind."""
     plain = replace(make_object_scene(PILE, GREY, SIZE, VIEWS, HELD_OUT), bounds=bound_primitives(PILE))
     boxes, masks = paste_boxes(plain, args.seeds[0])
     fisheye = replace(plain, train=render_fisheye(VIEWS, 0.0), val=render_fisheye(HELD_OUT, 0.7))
@@ -101,14 +101,14 @@ def measure(args: argparse.Namespace) -> Rows:
     }
     rows: Rows = []
     for name, scene in scenes.items():
-        found = []
+        psnrs = []
         for seed in args.seeds:
             print(f"photos: {name}, seed {seed}", flush=True)
             folder = args.output / "photos" / f"{name}_{seed}".replace(" ", "_")
-            found.append(
+            psnrs.append(
                 nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=DISABLED_OUTPUTS).psnr
             )
-        held = scene.train
-        row = {"photos": name, "psnr": fmean(found), "bytes/pixel": held.nbytes / len(held.pixels)}
+        train = scene.train
+        row = {"photos": name, "psnr": fmean(psnrs), "bytes/pixel": train.nbytes / len(train.pixels)}
         rows.append(row)
     return rows

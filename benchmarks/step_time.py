@@ -1,4 +1,4 @@
-"""What a training step costs on a device: time, operations, waits of the host and memory."""
+"""Cost of a training step on a device: time, operations, host syncs and memory."""
 
 import argparse
 import tempfile
@@ -29,17 +29,17 @@ from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 WARMUP_STEPS, TIMED_PERIODS = 320, 6
-"""Steps before the first that counts, and how many periods of the sampler's updates are timed after it."""
+"""Untimed steps, and the number of timed periods of the sampler's updates."""
 PROGRESS = 0.5
-"""The field has its full size from here on."""
+"""Training progress from which on the field has its full size."""
 BLOCK_STEPS = 32
-"""Steps in a row of one kind: two rounds of the occupancy grid, short against a machine's moods."""
+"""Consecutive steps of one kind: two updates of the occupancy grid, short against changes of the machine's load."""
 NUM_BLOCKS, FIRST_TIMED_BLOCK = 50, 10
-"""Blocks of each kind, and the first that counts."""
+"""Blocks of each kind, and the first timed one."""
 
 
 def build(overrides: list[str], device: torch.device = CPU) -> tuple[DictConfig, RayDataModule, NeRF3D]:
-    """Configuration, data and system of a 3D run, the process prepared as for training on a device, the system there."""
+    """Builds configuration, data and system of a 3D run on a device, and prepares the process as for training."""
     with tempfile.TemporaryDirectory() as folder:
         cfg = compose_config(overrides, Path(folder))
         silence_lightning()
@@ -56,7 +56,7 @@ def build(overrides: list[str], device: torch.device = CPU) -> tuple[DictConfig,
 def run_plain_step(
     system: NeRF3D, data: RayDataModule, optimizer: torch.optim.Optimizer, step: int, progress: float
 ) -> float:
-    """One step as NeRF3D does it under a Trainer, without Lightning, on the system's device. Returns its seconds."""
+    """Runs one training step of NeRF3D without Lightning; returns its seconds."""
     synchronize(system.device)
     start = time.perf_counter()
     system.state.set_progress(progress)
@@ -69,7 +69,7 @@ def run_plain_step(
     losses, system.stats = system.compute_losses(batch, generator)
     sum_losses(losses).backward()
     optimizer.step()
-    assert system.stats.squared_errors is not None  # a NeRF3D's
+    assert system.stats.squared_errors is not None
     data.update_error_map(system.stats.squared_errors, system.stats.complete_rays)
     if system.stats.is_sample_count_exact:
         data.adapt_num_rays(system.stats.samples)
@@ -78,7 +78,7 @@ def run_plain_step(
 
 
 def reset_peak_memory(device: torch.device) -> None:
-    """Begins to count the device's memory anew, where it can."""
+    """Resets the device's peak memory counter, where there is one."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
     elif device.type == "mps":
@@ -86,7 +86,7 @@ def reset_peak_memory(device: torch.device) -> None:
 
 
 def measure_method(overrides: list[str], device: torch.device) -> Row:
-    """One line. Operations and waits are counted step by step over a whole period of the sampler's updates."""
+    """Measures one method; operations and syncs are counted over one period of the sampler's updates."""
     reset_peak_memory(device)
     cfg, data, system = build(overrides, device)
     system.sampler.mark_invisible_cells(data.scene.train.cameras)
@@ -125,12 +125,10 @@ def measure_method(overrides: list[str], device: torch.device) -> Row:
 
 
 def measure_methods(device: torch.device, experiment: str, overrides: list[str]) -> Rows:
-    """A line a method, of the shipped size."""
+    """Measures all methods in their default size, one row each."""
     rows: Rows = []
     for name in METHODS:
-        print(
-            f"speed: {name}: {WARMUP_STEPS} steps until it has its full size, then {TIMED_PERIODS} rounds", flush=True
-        )
+        print(f"step_time: {name}: {WARMUP_STEPS} steps to its full size, then {TIMED_PERIODS} periods", flush=True)
         try:
             row = measure_method([f"+experiment={experiment}", f"recipe={name}_medium", *overrides], device)
         except DEVICE_ERRORS as error:
@@ -140,15 +138,15 @@ def measure_methods(device: torch.device, experiment: str, overrides: list[str])
 
 
 class Alternation(L.Callback):
-    """After each block of the Trainer's steps, takes as many without it: same field, same optimiser, same photos.
+    """Alternates blocks of the Trainer's steps with blocks of plain steps: same field, optimizer and photos.
 
-    Of every block the last step is left out, because in the Trainer's it ends in this callback's own work.
+    The last step of a block is not timed: in the Trainer's it includes this callback.
     """
 
     def __init__(self, data: RayDataModule) -> None:
         self.data = data
         self.trainer_blocks: list[float] = []
-        """Mean seconds of a step, one entry a block."""
+        """Mean seconds per step of each block."""
         self.bare_blocks: list[float] = []
         self._starts: list[float] = []
 
@@ -166,10 +164,9 @@ class Alternation(L.Callback):
 
 
 def measure_overhead(overrides: list[str]) -> dict[str, float]:
-    """Milliseconds of a step, bare and under a Trainer with all callbacks and the logger, in alternating blocks of one run.
+    """Milliseconds per step, plain and under a Trainer with all callbacks and the logger, in alternating blocks of one run.
 
-    Measurements and pictures, whose time is no training time, are moved out of the way; the share is the median over pairs of
-    neighbouring blocks, with its quartiles.
+    Validation and snapshots are disabled; the overhead is the median over pairs of neighbouring blocks, with quartiles.
     """
     steps = NUM_BLOCKS * BLOCK_STEPS + 1
     settings = [
@@ -179,10 +176,10 @@ def measure_overhead(overrides: list[str]) -> dict[str, float]:
         "callbacks.snapshots.steps=[]",
     ]
     cfg, data, system = build(settings)
-    own = RayDataModule(data.scene, data.rays, data.samples, cfg.seed)  # the Trainer has drawn its batch
-    sync_resolution_scale(system, own)
+    plain_data = RayDataModule(data.scene, data.rays, data.samples, cfg.seed)  # the Trainer advances the other's state
+    sync_resolution_scale(system, plain_data)
     with tempfile.TemporaryDirectory() as folder:
-        trainer, alternation = build_trainer(cfg, Path(folder), resolve_run_device(cfg)), Alternation(own)
+        trainer, alternation = build_trainer(cfg, Path(folder), resolve_run_device(cfg)), Alternation(plain_data)
         trainer.callbacks.insert(0, alternation)  # type: ignore[attr-defined]
         trainer.fit(system, data)
     full, bare = alternation.trainer_blocks[FIRST_TIMED_BLOCK:], alternation.bare_blocks[FIRST_TIMED_BLOCK:]
@@ -197,7 +194,7 @@ def measure_overhead(overrides: list[str]) -> dict[str, float]:
 
 
 def measure(args: argparse.Namespace) -> Rows:
-    """The step of each method; on a CPU also what Lightning adds."""
+    """Measures the step of each method; on a CPU also Lightning's overhead."""
     experiment = args.experiments[0]
     tables = {"steps": measure_methods(args.device, experiment, args.overrides)}
     if args.device == CPU:

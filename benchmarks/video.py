@@ -1,4 +1,4 @@
-"""How well the frames of a video are chosen, a third of which are blurred, and how well COLMAP places them."""
+"""Video frames: selection from a video with a third of its frames blurred, and their registration by COLMAP."""
 
 import argparse
 import os
@@ -27,13 +27,13 @@ from nerf_lightning.synthetic.tracer import render_shadow_map
 LENS = Intrinsics(480, 360, 420.0, 420.0, 242.0, 178.0, Distortion(k1=-0.1, k2=0.02))
 FLAWS = Flaws(blur=0.4, noise=2.0)
 TURN_FRAMES, PAUSE_FRAMES = 120, 30
-"""Pictures of a full turn; and those for which the camera stands still, after a third of it."""
+"""Frames of a full turn, and of the pause after a third of it."""
 FRAME_COUNTS = (20, 40)
-"""Frames to choose: the chance of a blurred one is highest where the stretches are short."""
+"""Numbers of frames to select; a blurred one is most likely if there are many."""
 
 
 def measure(args: argparse.Namespace) -> Rows:
-    """A turn around the bulldozer with a pause, by the number of chosen frames; the largest number is placed as well."""
+    """Measures a turn around the bulldozer with a pause, by number of selected frames; registers the largest number."""
     layout, seed, folder = SHEETS["six tags"], args.seeds[0], args.output
     c2w = place_cameras(layout, LENS, TURN_FRAMES)
     c2w = np.concatenate(
@@ -45,7 +45,7 @@ def measure(args: argparse.Namespace) -> Rows:
     )
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "turn.mp4"
-    write_video(file, blur_images(_pictures(c2w, seed), seed))
+    write_video(file, blur_images(_render_frames(c2w, seed), seed))
     rows: Rows = []
     for count in FRAME_COUNTS:
         started = time.perf_counter()
@@ -54,31 +54,31 @@ def measure(args: argparse.Namespace) -> Rows:
         frames.mkdir()
         write_frames(file, frames, count)
         photos = sorted(frames.glob("*.jpg"))
-        taken = [int(photo.stem) for photo in photos]
+        chosen = [int(photo.stem) for photo in photos]
         blurred = range(1, len(c2w), 3)
         row: Row = {
             "frames": len(c2w),
-            "chosen": len(taken),
-            "blurred_percent_rejected": 100 - 100 * len(set(taken) & set(blurred)) / len(blurred),
-            "chosen_in_pause": sum(TURN_FRAMES // 3 <= index <= TURN_FRAMES // 3 + PAUSE_FRAMES for index in taken),
-            "longest_gap": int(max(np.diff([count_moving_frames(index) for index in taken]))),
-            "choosing_seconds": time.perf_counter() - started,
+            "selected": len(chosen),
+            "blurred_percent_rejected": 100 - 100 * len(set(chosen) & set(blurred)) / len(blurred),
+            "selected_in_pause": sum(TURN_FRAMES // 3 <= index <= TURN_FRAMES // 3 + PAUSE_FRAMES for index in chosen),
+            "longest_gap": int(max(np.diff([count_moving_frames(index) for index in chosen]))),
+            "selection_seconds": time.perf_counter() - started,
         }
         if count == max(FRAME_COUNTS):
             started = time.perf_counter()
-            row |= _errors(run_sfm(photos[0].parent), c2w, len(taken))
-            row["placing_seconds"] = time.perf_counter() - started
+            row |= _measure_registration(run_sfm(photos[0].parent), c2w, len(chosen))
+            row["registration_seconds"] = time.perf_counter() - started
         rows.append(row)
     return rows
 
 
 def count_moving_frames(index: int) -> int:
-    """How many pictures of the turn come before one of the video."""
+    """Number of frames of the turn before a frame of the video, without the pause."""
     return min(index, max(TURN_FRAMES // 3, index - PAUSE_FRAMES))
 
 
-def _pictures(c2w: Float[np.ndarray, "N 4 4"], seed: int) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-    render_shadow_map()  # made once, before the threads ask for it
+def _render_frames(c2w: Float[np.ndarray, "N 4 4"], seed: int) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+    render_shadow_map()  # cached before the threads need it
     layout = SHEETS["six tags"]
 
     def render(index: int) -> UInt8[np.ndarray, "H W 3"]:
@@ -88,27 +88,27 @@ def _pictures(c2w: Float[np.ndarray, "N 4 4"], seed: int) -> Iterator[UInt8[np.n
         yield from pool.map(render, range(len(c2w)))
 
 
-def _errors(folder: Path, c2w: Float[np.ndarray, "N 4 4"], chosen: int) -> Row:
-    """Of the placed frames, once the model is moved onto the truth: centres in percent of their distance from the middle."""
+def _measure_registration(folder: Path, c2w: Float[np.ndarray, "N 4 4"], num_selected: int) -> Row:
+    """Errors of registered frames after alignment; centre errors in percent of the distance from the mean centre."""
     import pycolmap
 
     model = pycolmap.Reconstruction(folder)
     images = [image for image in model.images.values() if image.has_pose]
     truth = np.stack([c2w[int(Path(image.name).stem)] for image in images])
     last = [[0.0, 0.0, 0.0, 1.0]]
-    found = np.stack([invert_pose(np.concatenate([image.cam_from_world().matrix(), last])) for image in images])
-    moved = align_poses(found, truth)
+    poses = np.stack([invert_pose(np.concatenate([image.cam_from_world().matrix(), last])) for image in images])
+    ours = align_poses(poses, truth)
     distance = np.linalg.norm(truth[:, :3, 3] - truth[:, :3, 3].mean(0), axis=-1)
     camera = model.cameras[images[0].camera_id]
     return {
-        "placed": f"{len(images)}/{chosen}",
-        "centre_percent": 100 * float(np.median(np.linalg.norm(moved[:, :3, 3] - truth[:, :3, 3], axis=-1) / distance)),
-        "degrees": float(np.degrees(np.median([angle_between(a, b) for a, b in zip(moved, truth, strict=True)]))),
+        "registered": f"{len(images)}/{num_selected}",
+        "centre_percent": 100 * float(np.median(np.linalg.norm(ours[:, :3, 3] - truth[:, :3, 3], axis=-1) / distance)),
+        "degrees": float(np.degrees(np.median([angle_between(a, b) for a, b in zip(ours, truth, strict=True)]))),
         "focal_percent": 100 * abs(camera.mean_focal_length() / LENS.fx - 1),
     }
 
 
-def align_poses(found: Float[np.ndarray, "N 4 4"], truth: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
-    """Camera poses turned, shifted and scaled so that their centres fit the truth best."""
-    onto = fit_similarity(*(torch.from_numpy(poses[:, :3, 3]) for poses in (found, truth)))
-    return transform_poses(torch.from_numpy(found), onto).numpy()
+def align_poses(poses: Float[np.ndarray, "N 4 4"], truth: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
+    """Aligns camera poses by the similarity that best fits their centres to the truth."""
+    similarity = fit_similarity(*(torch.from_numpy(p[:, :3, 3]) for p in (poses, truth)))
+    return transform_poses(torch.from_numpy(poses), similarity).numpy()

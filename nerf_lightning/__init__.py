@@ -7,16 +7,16 @@ The tree is the data flow, seven stages in order:
     capture/    before all: photos with printed tags become a scene, with lens and camera poses
     dataset/    photos and poses become a Scene; data modules draw pixels or rays from it
     cameras/    Cameras (K, c2w, size) turn pixel coordinates into Rays; Bounds say where the content is
-    sampler/    Rays become Samples: where along each ray the field is asked
+    sampler/    Rays become Samples: where along each ray the field is evaluated
     model/      fields: position, direction -> density, rgb; encodings; 2D fields
-    kernels/    the hot loops of all of these: a plain reference beside a fast version for CPUs
+    kernels/    the hot loops of all of these: a plain reference, and a fast version for CPUs
     renderer/   Samples with density and rgb become colour, opacity, depth
     system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimiser
-    callbacks/  budget, guard, held-out PSNR, snapshots, orbit, checkpoints, progress, results.json
+    callbacks/  budget, divergence recovery, validation, snapshots, orbit, checkpoints, progress, results.json
     config/     command line -> configuration -> objects; build.py is the only place that instantiates
     training/   one run, from a configuration to the files in its folder; sweeps: many runs from one command line
     api.py      the same from Python: load_scene, train, load_run
-    runs/       run folders and compact files: found, read without trusting them, opened
+    runs/       run folders and compact files: finding, reading (untrusted), opening
 
 Each command is a typed function in cli/, which calls its room: capture/, check/, view/, render/, evaluate/, export/,
 comparison/ (speed against accuracy), sizing/ (the smallest model that is good enough), stability/ (methods where they
@@ -37,7 +37,7 @@ __all__ = ["Run", "View", "compare", "load_run", "load_scene", "rightsize", "tra
 
 
 def __getattr__(name: str) -> Any:
-    """Imports the front door when it is first asked for: the command line's help and errors need nothing heavy."""
+    """Imports the API on first access: the command line's help and errors need nothing heavy."""
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from nerf_lightning import api

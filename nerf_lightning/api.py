@@ -1,4 +1,4 @@
-"""The Python interface: scenes, trainings and runs, with the command line's defaults."""
+"""Python API: scenes, training and runs, with the command line's defaults."""
 
 import functools
 import math
@@ -45,7 +45,7 @@ T = TypeVar("T")
 
 
 def _make_method(function: Callable[P, T]) -> Callable[P, T]:
-    """A command as a method of what has the run's path, with the same options; it leaves the process as it was."""
+    """Makes a command a method on the run's path, with the same options; it preserves the process state."""
 
     @functools.wraps(function)
     def method(self: "Run | Exports", *args: Any, **kwargs: Any) -> T:
@@ -57,13 +57,13 @@ def _make_method(function: Callable[P, T]) -> Callable[P, T]:
 
 @dataclass(frozen=True)
 class View:
-    """A rendered view, on the run's background."""
+    """A rendered view on the run's background."""
 
     rgb: Float[Tensor, "H W 3"]
     """Colours in [0, 1]."""
     opacity: Float[Tensor, "H W"]
     depth: Float[Tensor, "H W"]
-    """Mean distance along the ray, in the scene's unit."""
+    """Mean distance along the ray, in scene units."""
 
 
 @dataclass(frozen=True)
@@ -71,24 +71,24 @@ class Run:
     """A trained run, ready to render."""
 
     path: Path
-    """Its folder, or its compact file."""
+    """Run folder, or compact file."""
     system: NeRF3D
     orbit: Cameras
-    """A path to show it along."""
+    """Camera path for videos."""
     results: dict[str, Any]
-    """What results.json says; empty for a compact file."""
+    """Content of results.json; empty for a compact file."""
 
     @property
     def psnr(self) -> float:
-        """Mean PSNR over the held-out views, in dB; nan if none was measured."""
+        """Mean PSNR of the held-out views in dB; nan if not measured."""
         psnr = self.results.get("psnr")
         return math.nan if psnr is None else float(psnr)
 
     def render(self, camera: Cameras) -> View:
-        """Renders the first of some cameras, for example `scene.val.cameras[0]`; the result is on the CPU."""
-        found = self.system.render(camera.generate_view_rays(0).to(self.system.device))
+        """Renders the first of the cameras, for example `scene.val.cameras[0]`; the result is on the CPU."""
+        output = self.system.render(camera.generate_view_rays(0).to(self.system.device))
         shape = (camera.height, camera.width)
-        rgb, opacity, depth = (x.cpu() for x in (found.rgb, found.opacity, found.depth))
+        rgb, opacity, depth = (x.cpu() for x in (output.rgb, output.opacity, output.depth))
         return View(rgb.clamp(0, 1).view(*shape, 3), opacity.view(shape), depth.view(shape))
 
     evaluate = _make_method(evaluate)
@@ -97,13 +97,13 @@ class Run:
 
     @property
     def export(self) -> "Exports":
-        """Writes the run as a file: `run.export.mesh(output="lego.glb")`, as `nerf_lightning export mesh` does."""
+        """Exports the run to a file: `run.export.mesh(output="lego.glb")`, as `nerf_lightning export mesh` does."""
         return Exports(self.path)
 
 
 @dataclass(frozen=True)
 class Exports:
-    """The sub-commands of `nerf_lightning export`, for one run."""
+    """Sub-commands of `nerf_lightning export`, for one run."""
 
     path: Path
 
@@ -116,15 +116,15 @@ class Exports:
 
 
 def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
-    """A scene in any format that the command line takes.
+    """Loads a scene in any format that the command line takes.
 
     Args:
         path: an .npz file, a Blender folder, or a nerfstudio / instant-ngp capture.
-        resize: longest side in pixels; larger photos are shrunk. "auto": what a training of 90 s on this machine's processor
-            can use, 800 pixels at least; None keeps the size.
+        resize: longest side in pixels; larger photos are downsampled. "auto": what 90 s of training on this machine's CPU can
+            use, 800 pixels at least; None keeps the size.
 
     Raises:
-        InputError: if there is none, or it is damaged.
+        InputError: if it does not exist or is damaged.
     """
     return open_scene(os.path.abspath(expand_user_path(path)), options=PhotoLoadOptions(resize))
 
@@ -137,12 +137,12 @@ def load_run(path: str | Path, device: str = "auto") -> Run:
         device: to render on: auto, cpu, cuda or mps.
 
     Raises:
-        InputError: if there is none, it is broken or a picture's, or the device is not available.
+        InputError: if it does not exist, is damaged or a picture's, or the device is not available.
     """
-    place = expand_user_path(path)
+    run_path = expand_user_path(path)
     with preserve_process_state():
-        found = open_scene_run(place, resolve_device(device))
-    return Run(place, found.system, found.orbit, read_run(place).results if place.is_dir() else {})
+        opened = open_scene_run(run_path, resolve_device(device))
+    return Run(run_path, opened.system, opened.orbit, read_run(run_path).results if run_path.is_dir() else {})
 
 
 def train(
@@ -159,25 +159,25 @@ def train(
     """Trains as `nerf_lightning train dataset=photos dataset.path=SCENE` does, with the same defaults and results.
 
     Args:
-        scene: from `load_scene`, or its path, whose photos are then read at the size that suits the budget.
-        recipe: a model with the settings that suit it, such as tensorf_medium; None for the command line's default.
+        scene: from `load_scene`, or its path, whose photos are then read at the size that fits the budget.
+        recipe: model with matching settings, such as tensorf_medium; None for the command line's default.
         seconds, steps: length of the training; with both, whichever ends first; without either, 90 seconds.
         seed: of weights, batches and jitter: the same seed, threads and steps give the same weights.
         device: auto, cpu, cuda or mps.
-        folder: of the run, which it owns while it trains; None creates one below outputs/, named after the scene and the time.
-        options: anything else the command line takes, such as ["renderer.background=white", "model.width=64"].
+        folder: of the run, locked while it trains; None creates one in outputs/, named after the scene and the time.
+        options: further overrides of the command line, such as ["renderer.background=white", "model.width=64"].
 
     Raises:
         InputError: as the command line does, in one line.
-        FileExistsError: if the folder holds a run (options=["overwrite=true"] replaces it), or one is going on in it.
-        KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` goes on from it.
+        FileExistsError: if the folder holds a run (options=["overwrite=true"] replaces it), or is in use by one.
+        KeyboardInterrupt: after Ctrl-C; the last state is saved, and the command line's `resume=` continues from it.
     """
     if isinstance(scene, str | Path):
         size = compute_auto_resize(seconds, steps, resolve_device(device), torch.get_num_threads())
         scene = open_scene(os.path.abspath(expand_user_path(scene)), options=PhotoLoadOptions(size))
-    default = Path("outputs", scene.name, datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
-    place = default if folder is None else expand_user_path(folder)
-    given = [
+    default_path = Path("outputs", scene.name, datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+    run_path = default_path if folder is None else expand_user_path(folder)
+    overrides = [
         "dataset=photos",
         make_override("dataset.path", scene.source),
         f"dataset.resize={scene.train.cameras.max_side}",
@@ -190,22 +190,22 @@ def train(
     ]
     try:
         with preserve_process_state(), handle_signals():
-            cfg = compose_config([*given, *options], place)
-            with lock_new_run_folder(place, cfg.overwrite, allow_suffix=folder is None) as place:
-                train_configured(cfg, folder=place, scene=scene)
+            cfg = compose_config([*overrides, *options], run_path)
+            with lock_new_run_folder(run_path, cfg.overwrite, allow_suffix=folder is None) as run_path:
+                train_configured(cfg, folder=run_path, scene=scene)
     except RunFolderInUse as error:
         raise FileExistsError(f"{error}; load_run opens it, another folder= keeps both") from error
-    except SignalInterrupt as interrupted:
-        signal.raise_signal(interrupted.signum)  # to the caller's own handlers
+    except SignalInterrupt as interrupt:
+        signal.raise_signal(interrupt.signum)  # to the caller's own handlers
         raise
-    return load_run(place, device)
+    return load_run(run_path, device)
 
 
 @contextmanager
 def preserve_process_state() -> Iterator[None]:
-    """Leaves the process as it was: random numbers, threads, kernels, denormal numbers, warnings, Hydra's state."""
+    """Restores the process state on exit: random state, threads, kernels, denormals, warnings, Hydra."""
     hydra, threads, kernels = HydraConfig.instance().cfg, torch.get_num_threads(), get_kernels()
-    flushed = float(torch.tensor(1e-40) * 1) == 0
+    flushes_denormals = float(torch.tensor(1e-40) * 1) == 0
     try:
         with warnings.catch_warnings(), isolate_rng():
             yield
@@ -213,4 +213,4 @@ def preserve_process_state() -> Iterator[None]:
         HydraConfig.instance().cfg = hydra
         torch.set_num_threads(threads)
         set_kernels(kernels)
-        torch.set_flush_denormal(flushed)
+        torch.set_flush_denormal(flushes_denormals)

@@ -1,4 +1,4 @@
-"""The data modules that configurations name: one function for each kind of source."""
+"""Builders of data modules, the Hydra targets of `conf/dataset`."""
 
 import logging
 import os
@@ -33,7 +33,6 @@ from nerf_lightning.utils.option_checks import Count, Ge
 log = logging.getLogger(__name__)
 
 DOWNLOAD_TIMEOUT_SECONDS = 10.0
-"""Seconds to wait for an answer."""
 
 
 def build_photo_data(
@@ -55,18 +54,18 @@ def build_photo_data(
     folder: str = "data",
     download: bool = True,
 ) -> RayDataModule:
-    """Posed photos in any supported format, or a published scene; without that, the built-in one.
+    """Builds a data module of posed photos, or of a published scene; the built-in one if the download fails.
 
     Args:
         path, name, near, far: see `open_scene`.
         resize, holdout, masked, invert_masks, bounded, orientation: see `PhotoLoadOptions`.
         rays, samples, seed, error_sampling: see `RayDataModule`.
-        url: public address of a file, for want of a path.
-        folder: where downloads are kept.
+        url: address of a published .npz file, used without `path`.
+        folder: where to store downloads.
         download: whether to use the network.
 
     Raises:
-        InputError: neither path nor url, or a scene that cannot be read.
+        InputError: neither path nor url, or an unreadable scene.
     """
     if path is None:
         if url is None:
@@ -86,18 +85,18 @@ def build_photo_data(
 
 
 def fetch_published(url: str, folder: Path, download: bool) -> str | None:
-    """The path of a published file, downloaded where it is not in the folder yet; None, with a warning, where that fails."""
+    """Returns the local path of a published file, downloading it if needed; None, with a warning, if that fails."""
     local = folder / url.rsplit("/", 1)[-1]
     if local.exists():
         return str(local)
-    problem = f"{local} is not there"
+    problem = f"{local} does not exist"
     if download:
         try:
             _download(url, local)
             return str(local)
         except OSError as error:
-            problem += f" and {url} could not be fetched ({error})"
-    log.warning("%s: the built-in scene 'bricks' stands in for it", problem)
+            problem += f" and downloading {url} failed ({error})"
+    log.warning("%s: using the built-in scene 'bricks' instead", problem)
     return None
 
 
@@ -110,7 +109,7 @@ def build_bricks_data(
     seed: int = 0,
     error_sampling: ErrorSampling = DEFAULT_ERROR_SAMPLING,
 ) -> RayDataModule:
-    """The built-in scene, see `bricks` and `RayDataModule`."""
+    """Builds the data module of the built-in scene, see `bricks` and `RayDataModule`."""
     return RayDataModule(bricks(size, train_views, val_views), rays, samples, seed, error_sampling)
 
 
@@ -130,15 +129,15 @@ def _download(url: str, target: Path) -> None:
 def build_picture_data(
     path: str | None = None, max_side: Count | None = None, pixels: Count | None = None, seed: int = 0
 ) -> PixelDataModule:
-    """A picture from a file, or the built-in one, see `load_picture` and `PixelDataModule`.
+    """Builds the data module of a picture from a file, or of the built-in one, see `load_picture`.
 
     Args:
-        path: the file, or None.
-        max_side: longest side in pixels after averaging, if smaller than the picture; the built-in one is made at this size.
+        path: image file; None for the built-in picture.
+        max_side: longest side in pixels, to which a larger picture is averaged; size of the built-in one.
         pixels, seed: see `PixelDataModule`.
     """
     if path is None:
-        # Drawn from formulas: known at any size.
+        # Procedural: available at any size.
         picture = Picture(
             "sunset", BUILT_IN, make_builtin_picture(max_side or 256), lambda width, _: make_builtin_picture(width)
         )
@@ -152,7 +151,7 @@ def build_picture_data(
 
 
 def downscale_picture(original: UInt8[Tensor, "H W 3"], width: int, height: int) -> UInt8[Tensor, "h w 3"] | None:
-    """A picture averaged to a size, None where it has fewer pixels itself (but for one, by rounding)."""
+    """Averages a picture down to a size; None if it is smaller itself (by more than one pixel of rounding)."""
     if width > original.shape[1] + 1 or height > original.shape[0] + 1:
         return None
     return torch.from_numpy(resize_area(original.numpy(), width, height))

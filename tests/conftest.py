@@ -70,10 +70,10 @@ settings.load_profile("tests")
 
 @pytest.fixture(scope="session")
 def real_data() -> Path:
-    """The folder of real scenes beside the checkout."""
+    """The folder of real scenes next to the checkout."""
     folder = ROOT.parent / "shared" / "data"
     if not folder.is_dir():
-        pytest.skip("no shared/data beside the checkout")
+        pytest.skip("no shared/data next to the checkout")
     return folder
 
 

@@ -1,4 +1,4 @@
-"""Everything on a device that is not the CPU: steps, what they ask of it, runs, and what is done with one."""
+"""Devices other than the CPU: training steps, their operations and synchronizations, runs, and tools."""
 
 import itertools
 import json
@@ -33,7 +33,7 @@ from tests.helpers.train_models import MODELS, SCENE
 
 SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
 ON_DEVICE = ("device=pretend", "+trainer.inference_mode=false", "~logger")
-"""Its tensors know no inference mode."""
+"""Its tensors do not support inference mode."""
 QUICK = ("model.growth_end=0.5", "sampler.update_every=4", "sampler.warmup=8")
 SAMPLERS = {
     "uniform": ["sampler=uniform", "sampler.samples=16"],
@@ -44,7 +44,7 @@ SAMPLERS = {
 
 
 def small_options(name: str) -> list[str]:
-    """A model's, small, growing where it does; with an orbit of two frames."""
+    """Builds a small system of a model and its data, with an orbit of two frames."""
     given = [option for option in MODELS[name] if option not in ("callbacks.orbit=null", "model.growth_end=1")]
     if name not in SCENES:
         return [f"model={name}", *given]
@@ -119,7 +119,7 @@ MAX_OPERATIONS = {"tensorf": 256, "hashgrid": 255, "voxels": 258, "mlp": 227}
     "name", [pytest.param(name, marks=() if name == "hashgrid" else pytest.mark.long) for name in MAX_OPERATIONS]
 )
 def test_training_step_on_device_needs_few_operations_and_no_wait(name: str, device: torch.device, tmp_path: Path):
-    """As shipped, of a field that has its size; reading a result, or its size, makes the host wait."""
+    """With shipped settings, at the final field size; reading a result, or its size, makes the host wait."""
     small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
     system, data = build_system_and_data([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
     assert isinstance(system, NeRF3D)
@@ -206,7 +206,7 @@ def test_train_on_device_finishes(name: str, device_without_float64: torch.devic
 
 
 def test_tools_run_of_cpu_work_on_device(device: torch.device, tmp_path: Path):
-    """Judged, filmed, exported and painted."""
+    """Evaluates, renders, exports and views a run."""
     run = tmp_path / "run"
     train(
         compose_config(
@@ -219,13 +219,13 @@ def test_tools_run_of_cpu_work_on_device(device: torch.device, tmp_path: Path):
     assert fmean(view["psnr"] for view in judged["views"]) == pytest.approx(expected, abs=0.01)
 
     render(run, frames=2, channels="rgb,depth,opacity", output=tmp_path / "film.webp", device=NAME)
-    render(run, path="test", output=tmp_path / "beside", device=NAME)
+    render(run, path="test", output=tmp_path / "frames", device=NAME)
     render(run, frames=1, background="transparent", output=tmp_path / "frames", device=NAME)
-    assert (tmp_path / "film.webp").exists() and len(list((tmp_path / "beside").glob("*.png"))) == 1
+    assert (tmp_path / "film.webp").exists() and len(list((tmp_path / "frames").glob("*.png"))) == 1
 
     box = (-0.9, -0.9, -0.9, 0.9, 0.9, 0.9)
     written = [
-        export_compact(run, output=tmp_path / "compact.npz", loss_db=3.0, device=NAME),
+        export_compact(run, output=tmp_path / "compact.npz", max_psnr_drop=3.0, device=NAME),
         export_mesh(run, output=tmp_path / "mesh.glb", resolution=24, box=box, device=NAME),
         export_points(run, output=tmp_path / "points.ply", resolution=24, device=NAME),
         export_voxels(run, output=tmp_path / "voxels.npz", resolution=24, device=NAME),
@@ -234,6 +234,6 @@ def test_tools_run_of_cpu_work_on_device(device: torch.device, tmp_path: Path):
 
     found = open_scene_run(run, device)
     for channel in ("rgb", "depth", "opacity"):
-        wish = ViewRequest(found.orbit.c2w[0].numpy(), 0.8, 1.5, channel, (1.0, 0.5, 0.0), 0.1, math.inf, 64)
-        picture = ProgressiveRenderer(found.system, found.orbit).render(wish, 24, lambda: True)
+        request = ViewRequest(found.orbit.c2w[0].numpy(), 0.8, 1.5, channel, (1.0, 0.5, 0.0), 0.1, math.inf, 64)
+        picture = ProgressiveRenderer(found.system, found.orbit).render(request, 24, lambda: True)
         assert picture.shape == (16, 24, 3) and picture.dtype == np.uint8 and picture.std() > 0

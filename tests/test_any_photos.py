@@ -69,7 +69,7 @@ def test_run_on_mixed_masked_fisheye_photos_writes_outputs(
     render(run.path, path="train", frames=4, output=film, device="cpu")
     assert imageio.improps(film, plugin="pillow", index=...).n_images == 4, "frames of two sizes make one film"
 
-    export_compact(run.path, loss_db=20.0, device="cpu")
+    export_compact(run.path, max_psnr_drop=20.0, device="cpu")
     assert (tmp_path / "run/compact.npz").exists()
     assert len(list(iterate_frusta(scene.train, 16))) == len(scene.train)
 

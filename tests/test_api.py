@@ -1,4 +1,4 @@
-"""import nerf_lightning as nl: what the command line does, from Python."""
+"""Python API: the same as the command line, from `import nerf_lightning as nl`."""
 
 import math
 from collections.abc import Iterator
@@ -46,7 +46,7 @@ def test_train_from_python_matches_command_line(path: Path, run_cli, tmp_path: P
     view = run.render(camera)
     assert view.rgb.shape == (16, 16, 3) and view.opacity.shape == view.depth.shape == (16, 16)
     assert torch.equal(view.rgb, run.render(scene.val.cameras[-2]).rgb)  # there are two
-    compact = nl.load_run(run.export.compact(output=tmp_path / "mine.npz", loss_db=3.0), device="cpu")
+    compact = nl.load_run(run.export.compact(output=tmp_path / "mine.npz", max_psnr_drop=3.0), device="cpu")
     assert math.isnan(compact.psnr) and float((compact.render(camera).rgb - view.rgb).abs().max()) < 0.2
 
 

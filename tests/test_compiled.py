@@ -1,4 +1,4 @@
-"""Training with torch.compile: the same values, gradients and quality, and one line where it cannot be had."""
+"""Training with torch.compile: the same values, gradients and quality, and a one-line error if unavailable."""
 
 import json
 import os
@@ -18,7 +18,7 @@ HELPER = ROOT / "tests" / "helpers" / "compile_models.py"
 
 
 def check_fields(cache: Path, *arguments: str) -> dict:
-    """What compile_models.py finds in a process of its own, after a look at its fields."""
+    """Report of compile_models.py, run in a process of its own."""
     paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(cache)}
     line = [sys.executable, str(HELPER), *arguments]
     done = subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
@@ -31,7 +31,7 @@ def check_fields(cache: Path, *arguments: str) -> dict:
 
 
 def test_compiled_fields_and_training_match_plain_ones(tmp_path: Path):
-    """One that the renderer is compiled with, one that grows, and a training."""
+    """A field with the compiled renderer, a growing one, and a training."""
     compiled, plain = check_fields(tmp_path, "aot_eager", "mlp", "voxels", "--train", str(tmp_path))["trained"]
     assert compiled == pytest.approx(plain, abs=0.05)
 

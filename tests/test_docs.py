@@ -61,7 +61,7 @@ COMPOSED = (
 """Commands that start processes of their own, are tested as such elsewhere, or take long: only their words are checked."""
 PYTHON = [
     ("seconds=15", f"steps=2, options={SCENE.replace('dataset.download=false ', '').split()}"),
-    ("output=", "loss_db=100, output="),
+    ("output=", "max_psnr_drop=100, output="),
 ]
 """Replacements that make the Python block of the README small."""
 
@@ -76,7 +76,7 @@ def commands(page: Path) -> list[str]:
 
 
 def place(tmp_path: Path) -> Path:
-    """A folder with a name of letters that shells, Hydra and URLs take apart."""
+    """A folder whose name needs quoting in shells, Hydra and URLs."""
     folder = tmp_path / "it's a test, (1) = ünï"
     folder.mkdir(exist_ok=True)
     return folder
@@ -138,14 +138,16 @@ def test_docs_page_commands_succeed(
     request: pytest.FixtureRequest,
 ):
     tmp_path = place(tmp_path)
-    (tmp_path / "ladder.yaml").write_text("rungs: [{finest: 8, coarsest: 8}, {finest: 12, coarsest: 8}]\n")
+    (tmp_path / "ladder.yaml").write_text(
+        "rungs: [{max_resolution: 8, base_resolution: 8}, {max_resolution: 12, base_resolution: 8}]\n"
+    )
     files = [block for language in ("python", "yaml") for block in blocks(page, language) if block.startswith("# ")]
     for block in files:
         file = tmp_path / block.splitlines()[0].removeprefix("# ")
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(block)
     if "--calibration sheet_photos" in page.read_text(encoding="utf-8"):
-        folder, _ = request.getfixturevalue("made")
+        folder, _ = request.getfixturevalue("tag_capture")
         shutil.copytree(folder / "calibration", tmp_path / "sheet_photos")
         shutil.copytree(folder / "photos", tmp_path / "object_photos")
     if "my_photos" in page.read_text(encoding="utf-8"):

@@ -77,5 +77,5 @@ def test_example_tour_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
     NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(tmp_path)}}).execute()
     pictures = [out for cell in notebook.cells for out in cell.get("outputs", []) if "image/png" in out.get("data", {})]
-    assert len(pictures) == 3, "photos, render beside truth, curve"
+    assert len(pictures) == 3, "photos, render and truth, curve"
     assert (tmp_path / "field.npz").is_file()

@@ -1,4 +1,4 @@
-"""Every shipped experiment runs, and the options it can be given do."""
+"""Every shipped experiment and every group option runs."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Equirectangular photos of a room: read, trained on with corrected poses, exported."""
+"""Equirectangular photos of a room: reading, training with pose refinement, export."""
 
 import json
 import math
@@ -30,7 +30,7 @@ UP = torch.tensor([0.0, 0.0, 1.0])
 
 
 def sample_poses(count: int, seed: int) -> torch.Tensor:
-    """Level cameras anywhere around the pile, turned any way about the vertical."""
+    """Level cameras at random positions around the pile, with random azimuths."""
     generator = torch.Generator().manual_seed(seed)
     turn, radius, height, heading = torch.rand(4, count, generator=generator)
     turn, heading = 2 * math.pi * turn, 2 * math.pi * heading
@@ -39,7 +39,7 @@ def sample_poses(count: int, seed: int) -> torch.Tensor:
 
 
 def render_photos(c2w: torch.Tensor) -> torch.Tensor:
-    """What a camera sees in all directions, by the definition of the projection: bytes."""
+    """Equirectangular photos by the definition of the projection: bytes."""
     longitude = ((torch.arange(2 * WIDTH) + 0.5) / (2 * WIDTH) - 0.5) * 2 * math.pi
     latitude = ((torch.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT) - 0.5)[:, None] * math.pi
     right, down, ahead = longitude.sin() * latitude.cos(), latitude.sin(), longitude.cos() * latitude.cos()

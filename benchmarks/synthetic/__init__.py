@@ -1,1 +1,1 @@
-"""Synthetic captures, whose cameras are known: what benchmarks and tests measure a capture against."""
+"""Synthetic captures with known cameras, for benchmarks and tests."""

@@ -1,4 +1,4 @@
-"""Photos of a printed sheet and an object, taken by known cameras through a known lens."""
+"""Synthetic photos of a printed sheet and an object, with known cameras and lens."""
 
 import functools
 import os
@@ -19,29 +19,29 @@ from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.synthetic.tracer import render_shadow_map
 
 BLOCK = 32
-"""Side of the blocks in pixels that are traced at once: as many rays as stay in a core's cache."""
+"""Side of the blocks that are traced at once, pixels: their rays fit into a core's cache."""
 
 
 @dataclass(frozen=True)
 class Flaws:
-    """What a real camera adds."""
+    """Blur and noise of a real camera."""
 
     blur: float = 0.5
-    """Standard deviation of a Gaussian, pixels."""
+    """Standard deviation of a Gaussian blur, pixels."""
     noise: float = 2.0
-    """Standard deviation of Gaussian noise, in steps of the 8-bit values."""
+    """Standard deviation of Gaussian noise, 8-bit levels."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What a capture must find."""
+    """Ground truth of a capture."""
 
     lens: Intrinsics
     layout: TagLayout
     calibration: dict[str, Float[np.ndarray, "4 4"]]
-    """Camera to world in metres, by file name, for the photos of the sheet alone."""
+    """Camera to world, metres, by file name, of the photos of the sheet alone."""
     photos: dict[str, Float[np.ndarray, "4 4"]]
-    """The same for the photos of the object."""
+    """The same of the photos of the object."""
 
 
 def render_photo(
@@ -54,21 +54,20 @@ def render_photo(
     samples: int = 3,
     hidden: bool = False,
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A photo of the tabletop, sRGB.
+    """Renders a photo of the tabletop, sRGB.
 
-    Each pixel is the mean of a grid of exact rays, taken in sRGB, so that an edge runs where half of a pixel's area is dark.
-    (A sensor takes the mean in linear light, which makes bright areas a little larger; detectors that fit edges in sRGB would
-    then be blamed for it.)
+    Each pixel is the mean of a grid of rays in sRGB, so that edges lie where half of a pixel's area is dark. (A sensor
+    averages linear light, which shifts edges toward dark areas; detectors that fit edges in sRGB would be blamed for it.)
 
     Args:
         layout: tags lying in the plane z = 0.
         lens: with or without distortion.
         c2w: the camera, above the table; metres.
         with_object: whether the bulldozer stands on the table.
-        flaws: what is added to the exact picture.
+        flaws: blur and noise added to the exact image.
         seed: of the noise.
-        samples: rays a pixel, along each side.
-        hidden: whether a blank sheet lies on the tags.
+        samples: rays along each side of a pixel.
+        hidden: whether a blank sheet covers the tags.
     """
     tabletop = Tabletop(layout, hidden)
     exact = np.empty((lens.height, lens.width, 3), np.float32)
@@ -78,8 +77,8 @@ def render_photo(
             block = np.s_[top : top + BLOCK, left : left + BLOCK]
             rays = grid[block].reshape(-1, 2) @ c2w[:3, :2].T + c2w[:3, 2]
             rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
-            colours = tabletop.colours(c2w[:3, 3], rays, with_object)
-            exact[block] = colours.reshape(*grid[block].shape[:3], 3).mean(2)
+            colors = tabletop.colors(c2w[:3, 3], rays, with_object)
+            exact[block] = colors.reshape(*grid[block].shape[:3], 3).mean(2)
     photo: np.ndarray = 255 * exact
     if flaws.blur > 0:
         photo = cv2.GaussianBlur(photo, (0, 0), flaws.blur)
@@ -89,17 +88,17 @@ def render_photo(
 
 @functools.lru_cache(maxsize=1)
 def _compute_tangents(lens: Intrinsics, n: int) -> Float[np.ndarray, "H W S 2"]:
-    """x / z and y / z of all samples in the camera frame; kept, because undoing the distortion takes as long as a photo.
+    """Normalized coordinates x / z, y / z of all samples; cached, because undistortion takes as long as a photo.
 
-    The samples of a pixel form a grid that is sheared both ways, so that no two share a row or a column: edges along the
-    frame come out as smooth as others.
+    The samples of a pixel form a grid that is sheared both ways, so that no two share a row or a column: axis-aligned edges
+    are as smooth as others.
     """
     i, j = (k.reshape(-1) for k in np.meshgrid(np.arange(n), np.arange(n)))
     col, row = np.meshgrid(np.arange(lens.width), np.arange(lens.height))
     x, y = col[..., None] + (i + (j + 0.5) / n) / n, row[..., None] + (j + (n - i - 0.5) / n) / n
     pixels = np.stack([x, y], axis=-1)
-    lines = [normalize_pixels(lens, line.reshape(-1, 2)).astype(np.float32) for line in pixels]
-    return np.stack(lines).reshape(pixels.shape)
+    rows = [normalize_pixels(lens, row_pixels.reshape(-1, 2)).astype(np.float32) for row_pixels in pixels]
+    return np.stack(rows).reshape(pixels.shape)
 
 
 def write_capture(
@@ -117,16 +116,16 @@ def write_capture(
     """Writes `calibration/000.png ...`, photos of the sheet alone, and `photos/000.png ...`, photos with the object.
 
     Args:
-        folder: made if it does not exist.
+        folder: created if missing.
         layout: tags lying in the plane z = 0.
         lens, flaws: of all photos.
-        sheet_views, object_views: how many photos of each kind.
-        seed: of cameras and noise; the same one gives the same bytes.
-        steps: of the photos of the object around a full turn; None spreads them evenly.
+        sheet_views, object_views: numbers of photos.
+        seed: of cameras and noise; deterministic to the byte.
+        steps: photos of the object per full turn; None spreads them evenly.
         samples: see `render_photo`.
-        hide: in every N-th photo of the object, from the second on, the tags are hidden; None: in none.
+        hide: the tags are hidden in every N-th photo of the object, from the second on; None: in none.
     """
-    _compute_tangents(lens, samples)  # made once, before the threads ask for it, and so is the shadow
+    _compute_tangents(lens, samples)  # cached, like the shadow map, before the threads need it
     render_shadow_map()
     seeds = iter(np.random.SeedSequence(seed).generate_state(2 + sheet_views + object_views).tolist())
     poses = {

@@ -1,4 +1,4 @@
-"""Captures with exact geometry, as files: the rooms of the stability suite, larger."""
+"""Room captures with exact geometry, as files: the rooms of the stability suite, larger."""
 
 import json
 from pathlib import Path
@@ -32,10 +32,10 @@ def write_room(room: Room, folder: Path, seed: int = 0) -> None:
 
 
 def render_true_view(room: Room, scene: Scene, view: int) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:
-    """Distance of what the rays of a held-out view meet, scene's unit, and the body's number."""
+    """True distance along the rays of a held-out view, scene's unit, and the index of the primitive hit."""
     rays, to_source = scene.val.cameras.generate_view_rays(view), scene.to_source
     scale = float(torch.linalg.det(to_source[:3, :3])) ** (1 / 3)
-    turn, shift = to_source[:3, :3].to(rays.origins), to_source[:3, 3].to(rays.origins)
-    there = Rays(rays.origins @ turn.mT + shift, rays.directions @ turn.mT / scale)
-    _, distance, which = trace_rays(room.primitives, there)
-    return distance / scale, which
+    rotation, shift = to_source[:3, :3].to(rays.origins), to_source[:3, 3].to(rays.origins)
+    source_rays = Rays(rays.origins @ rotation.mT + shift, rays.directions @ rotation.mT / scale)
+    _, distance, index = trace_rays(room.primitives, source_rays)
+    return distance / scale, index

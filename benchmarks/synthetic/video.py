@@ -1,4 +1,4 @@
-"""Videos of a known path around the tabletop, some of whose frames are blurred."""
+"""Videos along a known path around the tabletop, with some frames blurred."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -16,18 +16,18 @@ from nerf_lightning.capture.tags.tag_layout import TagLayout
 from nerf_lightning.dataset.intrinsics import Intrinsics
 
 CRF = 20
-"""Of H.264, about what phones write."""
+"""Constant rate factor of H.264, about that of phones."""
 FPS = 30
 
 
 def place_cameras(layout: TagLayout, lens: Intrinsics, count: int) -> Float[np.ndarray, "count 4 4"]:
-    """Camera to world: one smooth turn around the bulldozer, whose height and distance swing."""
+    """Camera-to-world poses of a smooth turn around the bulldozer, with varying height and distance."""
     top = Tabletop(layout)
     centre = top.box.mean(0)
-    reach = float(np.linalg.norm(top.box[1] - top.box[0])) / 2
+    radius = float(np.linalg.norm(top.box[1] - top.box[0])) / 2
     turns = 2 * np.pi * np.arange(count) / count
     elevation = np.radians(42 + 14 * np.sin(2 * turns))
-    distance = reach * 2.4 * lens.fx / lens.height * (1 + 0.12 * np.cos(3 * turns))
+    distance = radius * 2.4 * lens.fx / lens.height * (1 + 0.12 * np.cos(3 * turns))
     ring = np.cos(elevation)
     eye = centre + distance[:, None] * np.stack([ring * np.cos(turns), ring * np.sin(turns), np.sin(elevation)], -1)
     up = torch.tensor([0.0, 0.0, 1.0]).double()
@@ -37,7 +37,7 @@ def place_cameras(layout: TagLayout, lens: Intrinsics, count: int) -> Float[np.n
 def blur_image(
     picture: UInt8[np.ndarray, "H W 3"], pixels: float, angle: float | None = None
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """A picture blurred by a Gaussian of a standard deviation in pixels, or along a line that long at an angle (radians)."""
+    """Blurs an image by a Gaussian of a standard deviation in pixels, or along a line of that length and angle (radians)."""
     if angle is None:
         return cv2.GaussianBlur(picture, (0, 0), pixels)
     half = int(np.ceil(pixels / 2)) + 1
@@ -52,13 +52,13 @@ def blur_image(
 
 
 BLURS = ((0.5, False), (0.7, False), (1.0, False), (2.0, False), (1.5, True), (2.5, True), (4.0, True), (8.0, True))
-"""Pixels, and whether along a line; the weakest can hardly be seen."""
+"""Pixels, and whether along a line; the weakest are hardly visible."""
 
 
 def blur_images(
     pictures: Iterable[UInt8[np.ndarray, "H W 3"]], seed: int, every: int = 3
 ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-    """Pictures of which each `every`-th is blurred, from the second on, by each of `BLURS` in turn, along random lines."""
+    """Blurs every `every`-th image, from the second on, by each of `BLURS` in turn, along random lines."""
     rng = np.random.default_rng(seed)
     for index, picture in enumerate(pictures):
         pixels, line = BLURS[index // every % len(BLURS)]
@@ -67,12 +67,12 @@ def blur_images(
 
 
 def write_video(file: Path, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], quarter_turns: int = 0) -> None:
-    """H.264 as phones write it.
+    """Writes an H.264 video as phones do.
 
     Args:
         file: .mp4 or .mov to write.
         pictures: of even height and width.
-        quarter_turns: counter-clockwise, that a player gives the pictures, as the flag of a phone held upright does.
+        quarter_turns: counter-clockwise rotation flag, as in portrait videos of phones.
     """
     with av.open(str(file), "w") as container:
         stream: Any = container.add_stream("libx264", rate=FPS, options={"crf": str(CRF)})
@@ -87,11 +87,11 @@ def write_video(file: Path, pictures: Iterable[UInt8[np.ndarray, "H W 3"]], quar
 
 
 def _write_rotation(file: Path, quarter_turns: int) -> None:
-    """Writes the rotation into the track header, which no option reaches: a matrix of 16.16 numbers (ISO 14496-12)."""
+    """Writes the rotation into the track header, for which there is no option: a matrix of 16.16 numbers (ISO 14496-12)."""
     data = bytearray(file.read_bytes())
-    at = data.index(b"tkhd") + 4 + 40
+    start = data.index(b"tkhd") + 4 + 40
     c, s = round(np.cos(np.pi / 2 * quarter_turns)), round(np.sin(np.pi / 2 * quarter_turns))
     # Rows (a, b, u), (c, d, v), in a frame whose y points down.
     for offset, value in ((0, c), (4, -s), (12, s), (16, c)):
-        data[at + offset : at + offset + 4] = (value * 65536).to_bytes(4, "big", signed=True)
+        data[start + offset : start + offset + 4] = (value * 65536).to_bytes(4, "big", signed=True)
     file.write_bytes(data)

@@ -1,4 +1,4 @@
-"""What happens around the training steps: budget, measurement, pictures, checkpoints, progress, results."""
+"""Lightning callbacks: budget, validation, images, checkpoints, progress, results."""
 
 from nerf_lightning.callbacks.budget import Budget
 from nerf_lightning.callbacks.checkpoints import Checkpoints

@@ -1,4 +1,4 @@
-"""Budget: how long to train, by the steps or by the clock, and the clock itself; and what it leaves for rendering."""
+"""Budget: limits on steps and training seconds, the training clock, and the time for rendering."""
 
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -18,20 +18,20 @@ from nerf_lightning.utils.signals import defer_signals
 from nerf_lightning.utils.text import subsample
 
 MAX_PLATEAU_VIEWS, MAX_PLATEAU_PIXELS = 3, 1 << 16
-"""Held-out views rendered to look for a plateau, and about the most pixels of each."""
+"""Held-out views rendered to detect a plateau, and most pixels of each, about."""
 COOLDOWN_FRACTION = 0.15
-"""Cooling down after a plateau takes this share of what was spent up to it."""
+"""Length of the cool-down after a plateau, relative to the budget spent before it."""
 
 
 class Budget(L.Callback):
-    """Stops training when the budget is spent, or no longer worth spending, and tells the system its progress.
+    """Ends training at a step or time limit, or at a plateau, and sets the system's progress.
 
-    Training time is the wall clock from the first step on, less what runs inside `pause()` (evaluation, pictures). With
-    both limits, the first one reached ends the run.
+    Training time is the wall clock from the first step on, without `pause()` blocks (evaluation, images). With both limits, the
+    first one reached ends the run.
 
-    With `patience`, a few held-out views are rendered from time to time, with the clock stopped. When their quality reaches a
-    plateau, a field that is still growing jumps to its full size. One at full size cools down quickly: progress, and the
-    learning rate with it, runs to the end.
+    With `patience`, a few held-out views are rendered from time to time, with the clock stopped. At a plateau of their PSNR, a
+    field that is still growing jumps to its full size. One at full size cools down quickly: progress, and the learning rate
+    with it, runs to the end.
 
     Args:
         steps: optimiser steps, or None.
@@ -39,7 +39,7 @@ class Budget(L.Callback):
         patience: dB that 50 % more time must still gain; None spends the whole budget.
 
     Raises:
-        InputError: where steps and seconds are None.
+        InputError: if both steps and seconds are None.
     """
 
     def __init__(
@@ -54,17 +54,16 @@ class Budget(L.Callback):
         self.max_seconds = seconds
         self.plateau_detector = PlateauDetector(patience) if patience is not None else None
         self.state = TrainingState()
-        """The system's, from `setup` on."""
+        """The system's training state, from `setup` on."""
         self.final_plateau: dict[str, float] | None = None
-        """The plateau that ends the run: its `seconds` and `step`, and `rest_db`, what the rest of the budget would add."""
+        """Plateau that ends the run: its `seconds` and `step`, and `rest_db`, the predicted gain of the remaining budget."""
         self._progress_line = (0.0, 0.0, 1.0)
-        """Progress is a line over the share spent: (start, progress there, slope)."""
+        """Progress as a line over the fraction spent: (start, progress there, slope)."""
         self.render_timer = RenderTimer()
-        """Of what is rendered beside training."""
+        """Times rendering between training steps."""
 
     @staticmethod
     def find(trainer: L.Trainer) -> "Budget":
-        """The trainer's budget."""
         budget = find_callback(trainer, Budget)
         if budget is None:
             raise RuntimeError("a trainer needs a Budget among its callbacks; build_trainer puts one there")
@@ -81,31 +80,30 @@ class Budget(L.Callback):
         return max(by_steps, self.seconds / self.max_seconds if self.max_seconds is not None else 0.0)
 
     def progress(self, step: int) -> float:
-        """Share of the training done after `step` steps, in [0, 1]: that of the limits spent, until there is a plateau."""
+        """Training progress in [0, 1] after `step` steps: the fraction spent, until a plateau."""
         spent = self.spent_fraction(step)
         start, reached, slope = self._progress_line
         return min(1.0, max(spent, reached + slope * (spent - start)))
 
     def render_allowance_seconds(self, step: int) -> float:
-        """Seconds that rendering beside training may take: as long as training is expected to take, judged after `step` steps,
-        and at least `MIN_RENDER_SECONDS`."""
+        """Seconds that rendering may take: the expected training time, at least `MIN_RENDER_SECONDS`."""
         return max(MIN_RENDER_SECONDS, self.seconds + (self.seconds_left(step) or 0.0))
 
     def seconds_left(self, step: int) -> float | None:
-        """Seconds of training still to come, judged after `step` steps; None before the first."""
+        """Expected seconds of training left after `step` steps; None before the first."""
         spent = self.spent_fraction(step)
         start, reached, slope = self._progress_line
         end = min(1.0, start + (1 - reached) / slope)
         return max(0.0, end - spent) * self.seconds / spent if spent else None
 
     def pause(self) -> AbstractContextManager[None]:
-        """Stops the clock for work that is not training."""
+        """Pauses the clock for work that is not training."""
         return self.state.clock.pause()
 
     @contextmanager
     def pause_to_render(self, trainer: L.Trainer, subject: str) -> Iterator[None]:
-        """Stops the clock for a block that renders, which a signal ends: it must change nothing that a checkpoint keeps."""
-        is_single_process = trainer.world_size == 1  # several processes leave together, at the end of a step
+        """Pauses the clock to render. A signal may interrupt the block, so it must not change checkpointed state."""
+        is_single_process = trainer.world_size == 1  # several processes stop together, at the end of a step
         with (
             self.pause(),
             self.render_timer.measure(subject),
@@ -114,7 +112,7 @@ class Budget(L.Callback):
             yield
 
     def sync_progress(self, trainer: L.Trainer) -> float:
-        """`progress`, the same in all processes of a run."""
+        """Progress, equal in all processes of a run."""
         progress = self.progress(trainer.global_step)
         return progress if self.max_seconds is None else broadcast_from_rank_zero(trainer, progress)
 
@@ -142,10 +140,10 @@ class Budget(L.Callback):
         if not plateau.is_due(spent):
             return
         data = get_datamodule(trainer)
-        chosen = subsample(data.num_held_out_views, MAX_PLATEAU_VIEWS)
-        some = make_subset(max(map(data.count_held_out_pixels, chosen)), MAX_PLATEAU_PIXELS)
+        views = subsample(data.num_held_out_views, MAX_PLATEAU_VIEWS)
+        subset = make_subset(max(map(data.count_held_out_pixels, views)), MAX_PLATEAU_PIXELS)
         with self.pause_to_render(trainer, "views to look for a plateau"):
-            psnr = fmean(view.psnr for view in system.evaluate_held_out(data, chosen, some))
+            psnr = fmean(view.psnr for view in system.evaluate_held_out(data, views, subset))
         if not broadcast_from_rank_zero(trainer, plateau.add_measurement(spent, psnr)):
             return
         growth = system.field.growth
@@ -157,7 +155,7 @@ class Budget(L.Callback):
         self._progress_line = (spent, self.state.progress, (1 - self.state.progress) / (COOLDOWN_FRACTION * spent))
         self.final_plateau = {"seconds": round(self.seconds, 3), "step": step, "rest_db": round(remaining_gain_db, 3)}
         print(
-            f"budget: plateau after {self.seconds:.1f} s: the rest would bring {remaining_gain_db:.2f} dB; cooling down",
+            f"budget: plateau after {self.seconds:.1f} s: the rest would gain {remaining_gain_db:.2f} dB; cooling down",
             flush=True,
         )
 
@@ -166,12 +164,8 @@ class Budget(L.Callback):
 
     def state_dict(self) -> dict[str, Any]:
         plateau = None if self.plateau_detector is None else self.plateau_detector.state
-        return {
-            "seconds": self.seconds,
-            "line": self._progress_line,
-            "final_plateau": self.final_plateau,
-            "plateau": plateau,
-        }
+        plateaus = {"final_plateau": self.final_plateau, "plateau": plateau}
+        return {"seconds": self.seconds, "line": self._progress_line, **plateaus}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self._progress_line, self.final_plateau = state_dict["line"], state_dict["final_plateau"]
@@ -181,33 +175,32 @@ class Budget(L.Callback):
 
 
 class RenderingCallback(L.Callback):
-    """A callback that renders views, in the time that the run has for them."""
+    """Base class of callbacks that render views within the run's time for rendering."""
 
     weight = 1.0
-    """Of its time, where there is not enough for all."""
+    """Weight of its share of the time."""
 
     def count_remaining_pixels(self, trainer: L.Trainer) -> float:
-        """Pixels that are still to be rendered, where there is time for all."""
+        """Pixels left to render at full size."""
         raise TypeError(f"{type(self).__name__} must define count_remaining_pixels(trainer)")
 
     def compute_affordable_fraction(self, trainer: L.Trainer, system: System, pixels: float | None = None) -> float:
-        """The share of so many pixels for which there is time; None takes all that are left."""
+        """Fraction of `pixels` that there is time to render; None: of all that are left."""
         render_timer, data = Budget.find(trainer).render_timer, get_datamodule(trainer)
         if render_timer.seconds_per_pixel is None:
-            some = make_subset(data.count_held_out_pixels(0), PROBE_PIXELS)
-            with Budget.find(trainer).pause_to_render(trainer, "a first look"):
-                (view,) = system.evaluate_held_out(data, [0], some)
+            subset = make_subset(data.count_held_out_pixels(0), PROBE_PIXELS)
+            with Budget.find(trainer).pause_to_render(trainer, "a first view"):
+                (view,) = system.evaluate_held_out(data, [0], subset)
             render_timer.add_timing(view.num_pixels, view.seconds)
-        cost = (self.count_remaining_pixels(trainer) if pixels is None else pixels) * (
-            render_timer.seconds_per_pixel or 0.0
-        )
+        pixels = self.count_remaining_pixels(trainer) if pixels is None else pixels
+        cost = pixels * (render_timer.seconds_per_pixel or 0.0)
         return min(1.0, allocate_render_seconds(trainer)[self] / cost) if cost else 1.0
 
 
 def allocate_render_seconds(trainer: L.Trainer) -> dict[RenderingCallback, float]:
     """Seconds that each callback may still render; 0 before the first view."""
     budget = Budget.find(trainer)
-    jobs = [one for one in trainer.callbacks if isinstance(one, RenderingCallback)]  # type: ignore[attr-defined]
-    costs = {one: one.count_remaining_pixels(trainer) * (budget.render_timer.seconds_per_pixel or 0.0) for one in jobs}
+    jobs = [job for job in trainer.callbacks if isinstance(job, RenderingCallback)]  # type: ignore[attr-defined]
+    costs = {job: job.count_remaining_pixels(trainer) * (budget.render_timer.seconds_per_pixel or 0.0) for job in jobs}
     allowance = budget.render_allowance_seconds(trainer.global_step) - budget.render_timer.seconds
-    return allocate_max_min_fair(costs, {one: one.weight for one in jobs}, allowance)
+    return allocate_max_min_fair(costs, {job: job.weight for job in jobs}, allowance)

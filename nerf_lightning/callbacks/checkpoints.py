@@ -1,4 +1,4 @@
-"""Checkpoints: the last state, to resume from, and the best one measured."""
+"""Checkpoints: the last state, to resume from, and the best one by validation PSNR."""
 
 import time
 from contextlib import ExitStack
@@ -22,23 +22,22 @@ from nerf_lightning.utils.signals import SignalInterrupt, defer_signals, install
 from nerf_lightning.utils.text import subsample
 
 CHECKPOINT_FOLDER = "checkpoints"
-"""Below the run folder."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Writes a file beside the path, then renames it. Lightning writes into memory and the system's temporary folder."""
+    """Writes checkpoints atomically, without Lightning's detour through memory and the system's temporary folder."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None) -> None:
-        # Errors of Python's files say that a disk is full, unlike those of PyTorch's own writer.
+        # Errors of Python's files report a full disk, unlike those of PyTorch's own writer.
         with atomic_write(Path(path)) as temporary, temporary.open("wb") as file:
             torch.save(checkpoint, file)
 
 
 class Checkpoints(L.Callback):
-    """Keeps `last.ckpt` and `best.ckpt`. Each is written whole, then renamed: a killed run keeps the one before.
+    """Keeps `last.ckpt` and `best.ckpt`, each written atomically: a killed run keeps the previous one.
 
-    A run that is asked to end (Ctrl-C, SIGTERM) finishes its step, or the view that it measures, and saves `last.ckpt`:
-    going on from there gives the same weights.
+    On Ctrl-C or SIGTERM a run finishes its step, or the view that it measures, and saves `last.ckpt`: resuming from there gives
+    the same weights.
 
     Args:
         every_seconds: wall-clock seconds between saves of `last.ckpt`; it is also saved at the end.
@@ -91,13 +90,13 @@ class Checkpoints(L.Callback):
             self._deferred_signals.__exit__(type(exception), exception, exception.__traceback__)
 
     def on_test_end(self, trainer: L.Trainer, pl_module: System) -> None:
-        """The final state competes for `best.ckpt` too, on the same views as the earlier ones."""
+        """Lets the final state compete for `best.ckpt`, on the same views as the earlier ones."""
         validation, evaluation = find_callback(trainer, PeriodicValidation), find_callback(trainer, Evaluation)
         last = Path(trainer.default_root_dir) / CHECKPOINT_FOLDER / "last.ckpt"
         if evaluation is None or not trainer.is_global_zero or not last.exists():
             return
         earlier, views = ([], None) if validation is None else (validation.curve, validation.views)
-        same = [evaluation.view_metrics[view] for view in subsample(len(evaluation.view_metrics), views)]
-        final = compute_statistic(same, fmean, "psnr")
+        metrics = [evaluation.view_metrics[view] for view in subsample(len(evaluation.view_metrics), views)]
+        final = compute_statistic(metrics, fmean, "psnr")
         if not earlier or (final is not None and final > max(point[2] for point in earlier)):
-            link_file(last, last.with_name("best.ckpt"))  # of a large picture's field each is 900 MB
+            link_file(last, last.with_name("best.ckpt"))  # for a large picture each takes 900 MB

@@ -1,4 +1,4 @@
-"""DivergenceRecovery: notices when training has broken down, says why, and restarts it."""
+"""Divergence recovery: detects when training has broken down, and restarts it."""
 
 import copy
 import math
@@ -18,11 +18,11 @@ from nerf_lightning.utils.option_checks import Count, Ge
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 LR_CUT_AFTER_LEARNING, LR_CUT = 0.3, 0.2
-"""Factors on the learning rate when it is the cause: after something was learned, and when nothing was."""
+"""Learning-rate factors of a restart: if the field had learned or diverged, and if it never learned."""
 RESTART_WARMUP_STEPS = 100
-"""Steps of warm-up after a restart because of the rate ..."""
+"""Warm-up steps after a restart with a lower learning rate ..."""
 RESTART_LR_DECAY = 0.1
-"""... and the extra factor it decays to by the end, as nobody knows how much lower it should be."""
+"""... and the extra factor it decays to by the end, as the right learning rate is unknown."""
 
 
 @dataclass(frozen=True)
@@ -36,21 +36,21 @@ class Recovery:
 
 
 class DivergenceRecovery(L.Callback):
-    """Watches the loss, the density and the gradients, and acts when nothing more will be learned.
+    """Detects diverged or stalled training and restarts it with one change.
 
-    It notices a loss or weights that are no longer finite; a loss that rose and stays high; a loss stuck at that of one plain
-    colour, because there is no density, density everywhere, or no gradient (see `LossMonitor`). It then goes back to the last
-    good weights with a lower learning rate. If there are none yet, it starts again with fresh weights, and with softplus in
-    place of a ReLU that can die, or else a lower rate. Before the first step it lowers a rate that is known to be too high
-    for the field. Each action is printed and listed in results.json.
+    Detects loss or weights that are not finite; a loss that rose and stays high; a loss stuck at that of a constant colour,
+    because there is no density, density everywhere, or no gradient (see `LossMonitor`). It then restores the last good weights
+    with a lower learning rate. If there are none yet, it restarts with fresh weights, and with softplus in place of a ReLU that
+    can die, or else a lower learning rate. Before the first step it caps the learning rate at the field's known maximum. Each
+    action is printed and listed in results.json.
 
-    Weights and gradients are checked only every few steps, and gradients only until the field has begun to learn. With several
-    processes it does nothing.
+    Weights and gradients are checked only every few steps, and gradients only until the field has begun to learn. Inactive with
+    several processes.
 
     Args:
-        max_restarts: most times that it acts; 0 turns it off.
+        max_restarts: most restarts; 0 turns it off.
         every: steps between checks.
-        patience: steps within which the loss must fall below that of a plain colour, or at least fall.
+        patience: steps within which the loss must fall below that of a constant colour, or at least fall.
         snapshot_every: steps between copies of good weights.
     """
 
@@ -71,7 +71,7 @@ class DivergenceRecovery(L.Callback):
         self.uses_softplus = False
         self._is_exhausted = False
         self._pending_losses: list[Tensor] = []
-        """Since the last check: reading one means waiting for the device."""
+        """Losses since the last check: reading one synchronizes with the device."""
         self._initial_state: dict[str, Tensor] = {}
         self._good_state: dict[str, Tensor] = {}
 
@@ -133,7 +133,7 @@ class DivergenceRecovery(L.Callback):
         self._read_losses()
 
     def _read_losses(self) -> None:
-        """Reads the losses since the last check, all at once."""
+        """Reads the pending losses with one synchronization."""
         losses = torch.stack(self._pending_losses).tolist() if self._pending_losses else []
         self._pending_losses = []
         for loss in losses:
@@ -143,7 +143,7 @@ class DivergenceRecovery(L.Callback):
         self._read_losses()
         return {
             "history": asdict(self.monitor.history),
-            "recoveries": [asdict(one) for one in self.recoveries],
+            "recoveries": [asdict(recovery) for recovery in self.recoveries],
             "rate": self.lr_factor,
             "restart_progress": self.restart_progress,
             "softened": self.uses_softplus,
@@ -152,7 +152,7 @@ class DivergenceRecovery(L.Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.monitor.history = LossHistory(**state_dict["history"])
-        self.recoveries = [Recovery(**one) for one in state_dict["recoveries"]]
+        self.recoveries = [Recovery(**fields) for fields in state_dict["recoveries"]]
         self.lr_factor, self.restart_progress = state_dict["rate"], state_dict["restart_progress"]
         self.uses_softplus, self._is_exhausted = state_dict["softened"], state_dict["given_up"]
 
@@ -162,7 +162,7 @@ class DivergenceRecovery(L.Callback):
         step = trainer.global_step
         if len(self.recoveries) >= self.max_restarts:
             self._is_exhausted = True
-            print(f"recovery: step {step}: {failure.cause}; given up after {self.max_restarts} attempts", flush=True)
+            print(f"recovery: step {step}: {failure.cause}; giving up after {self.max_restarts} restarts", flush=True)
             return
         if self._good_state:
             system.load_state_dict(self._good_state)
@@ -184,7 +184,7 @@ class DivergenceRecovery(L.Callback):
         print(f"recovery: step {step}: {cause}; {action}", flush=True)
 
     def _cap_learning_rate(self, trainer: L.Trainer, system: System) -> None:
-        """Before the first step: lowers a rate that is known to be too high for the field."""
+        """Caps the learning rate at the field's known maximum, before the first step."""
         optimizer = trainer.optimizers[0]
         requested_lr, max_lr = optimizer.param_groups[0]["initial_lr"], system.field.max_lr
         if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and requested_lr > max_lr:
@@ -195,9 +195,9 @@ class DivergenceRecovery(L.Callback):
             self._record(trainer, cause, f"{self.lr_factor:.2g} times the learning rate")
 
     def _restart(self, system: System, step: int, diverged: bool) -> str:
-        """Fresh weights, and one other change: the same again would fail again."""
+        """Reinitializes the weights and changes one thing, so that the failure is not repeated."""
         system.load_state_dict(self._initial_state)
-        # On the CPU: the same weights on every device, and none of its random numbers used up.
+        # On the CPU: the same weights on every device, whose random state does not change.
         fresh = copy.deepcopy(system.field).cpu()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(step_generator(system.seed, Stream.RESTART, step).initial_seed() & 0xFFFFFFFF))
@@ -220,10 +220,10 @@ class DivergenceRecovery(L.Callback):
 
 
 def copy_state(module: torch.nn.Module) -> dict[str, Tensor]:
-    """A copy of all weights and buffers."""
+    """Copies all weights and buffers."""
     return {key: value.detach().clone() for key, value in module.state_dict().items()}
 
 
 def is_finite(module: torch.nn.Module) -> bool:
-    """Whether all weights are finite. A sum shows any that is not, so one value is read for all."""
+    """Whether all weights are finite, by their sums, so that one value is read for all."""
     return bool(torch.stack([parameter.detach().sum() for parameter in module.parameters()]).isfinite().all())

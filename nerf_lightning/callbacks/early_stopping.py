@@ -1,22 +1,22 @@
-"""Early stopping: when more training is no longer worth its time, judged by the held-out quality over time."""
+"""Early stopping: predicts from held-out PSNR over time what more training would gain."""
 
 import math
 
 import numpy as np
 
 MEASUREMENT_SPACING = 1.15
-"""Each measurement comes when this factor more has been spent than at the one before."""
+"""Ratio of the budget spent between consecutive measurements."""
 FIRST_MEASUREMENT = 0.01
-"""Share of the budget spent at the first measurement."""
+"""Fraction of the budget spent at the first measurement."""
 TREND_WINDOW = 2.0
-"""The trend is taken over the measurements since this factor less was spent ..."""
+"""Ratio of the budget spent over which the trend is fitted ..."""
 MIN_MEASUREMENTS = 4
-"""... if there are at least this many."""
+"""... if it holds at least this many measurements."""
 EXTRA_TIME_FACTOR = 1.5
 
 
 class PlateauDetector:
-    """Held-out quality grows roughly with the logarithm of time: the slope says what more time would gain.
+    """Fits held-out PSNR over log time: the slope predicts the gain of more time.
 
     Args:
         patience: dB that 50 % more time must still gain.
@@ -25,19 +25,14 @@ class PlateauDetector:
     def __init__(self, patience: float):
         self.patience = patience
         self.state: tuple[list[tuple[float, float]], int] = ([], 0)
-        """(fraction of the budget spent, dB) of each measurement, and how many in a row say that more are not worth it."""
+        """(fraction of the budget spent, dB) of each measurement, and the number of consecutive ones at a plateau."""
 
     def is_due(self, spent: float) -> bool:
-        """Whether it is time for another measurement."""
         points, _ = self.state
         return spent >= (points[-1][0] * MEASUREMENT_SPACING if points else FIRST_MEASUREMENT)
 
     def add_measurement(self, spent: float, psnr: float) -> bool:
-        """Adds a measurement.
-
-        Returns:
-            Whether there is a plateau: two measurements in a row say so, as one may be luck.
-        """
+        """Adds a measurement. Returns whether there is a plateau: two in a row, as one may be noise."""
         points, flat_streak = self.state
         points.append((spent, psnr))
         gain = self.predict_gain(EXTRA_TIME_FACTOR)
@@ -46,7 +41,7 @@ class PlateauDetector:
         return flat_streak >= 2
 
     def predict_gain(self, factor: float) -> float | None:
-        """dB that `factor` times the time spent would gain by the present trend; None with too few measurements."""
+        """Predicted gain in dB of `factor` times the time spent; None with too few measurements."""
         points, _ = self.state
         recent = [point for point in points if point[0] * TREND_WINDOW >= points[-1][0]]
         if len(recent) < MIN_MEASUREMENTS:
@@ -55,5 +50,5 @@ class PlateauDetector:
         return float(np.polyfit(np.log(spent), psnr, 1)[0]) * math.log(factor)
 
     def reset_trend(self) -> None:
-        """Forgets the trend, as training enters another stage."""
+        """Discards the trend, as the field enters another growth stage."""
         self.state = self.state[0][-1:], 0

@@ -1,4 +1,4 @@
-"""Evaluation: the figures of a trained field."""
+"""Evaluation: the final metrics of a trained field."""
 
 import math
 import sys
@@ -33,22 +33,22 @@ RESULT_KEYS = (
 
 
 class Evaluation(RenderingCallback):
-    """Measures all held-out views after training, then the scene's test split and how well photos fit.
+    """Measures all held-out views after training, then the test split and the training photos.
 
-    Where time is short (see `RenderingCallback`), held-out views are measured on strips of rows that lie
-    evenly in each view, and fewer views of the test split, evenly chosen.
+    Where time is short (see `RenderingCallback`), held-out views are measured on evenly spaced strips of rows, and fewer views
+    of the test split.
     """
 
     weight = 30.0
 
     def __init__(self) -> None:
         self.metrics: dict[str, Any] = dict.fromkeys(RESULT_KEYS)
-        """For results.json; None for what is not measured, or not yet."""
+        """For results.json; None if not measured, or not yet."""
         self.view_metrics: list[dict[str, float]] = []
-        """PSNR, SSIM, seconds of rendering, and the PSNR of one plain colour, of each held-out view."""
+        """PSNR, SSIM, render seconds and constant-colour PSNR of each held-out view."""
         self.photo_psnrs: list[float] = []
-        """PSNR of the training photos; none of a picture."""
-        self._row_fraction = 1.0  # share of each held-out view's that is measured
+        """PSNR of the training photos; empty for a picture."""
+        self._row_fraction = 1.0  # of each held-out view, measured
 
     def count_remaining_pixels(self, trainer: L.Trainer) -> float:
         data, test = get_datamodule(trainer), get_datamodule(trainer).scene.test
@@ -102,26 +102,23 @@ class Evaluation(RenderingCallback):
                 {"photo": train.name(i), "number": i, "psnr": round(self.photo_psnrs[i], 2)}
                 for i in find_outlier_photos(self.photo_psnrs)
             ]
-        metrics["peak_memory_bytes"] = get_peak_memory_bytes(pl_module.device)  # charts and films take more
+        metrics["peak_memory_bytes"] = get_peak_memory_bytes(pl_module.device)  # charts take more
 
     def _measure_test_split(self, trainer: L.Trainer, system: System, views: Views) -> dict[str, Any]:
-        """Figures of as many views of the test split as there is time for."""
-        fraction, render_timer, measured = (
-            self.compute_affordable_fraction(trainer, system),
-            Budget.find(trainer).render_timer,
-            [],
-        )
+        """Metrics of as many test views as there is time for."""
+        fraction, metrics = self.compute_affordable_fraction(trainer, system), []
+        render_timer = Budget.find(trainer).render_timer
         chosen = subsample(len(views), max(1, int(fraction * len(views))))
         for number, view in enumerate(chosen, 1):
             with render_timer.measure(f"test view {number} of {len(chosen)}"):
                 (result,) = system.evaluate_views([make_view_batch(views, view)])
-                measured.append({"psnr": result.psnr, "ssim": result.ssim})
+                metrics.append({"psnr": result.psnr, "ssim": result.ssim})
             render_timer.add_timing(result.num_pixels, result.seconds)
-        return {**summarize_views(measured), "views": len(measured), "views_in_split": len(views)}
+        return {**summarize_views(metrics), "views": len(metrics), "views_in_split": len(views)}
 
 
 def summarize_views(views: Sequence[dict[str, float]]) -> dict[str, Any]:
-    """Means over views, and the worst of them."""
+    """Mean PSNR and SSIM over views, and the worst PSNR."""
     return {
         "psnr": compute_statistic(views, fmean, "psnr"),
         "ssim": compute_statistic(views, fmean, "ssim"),
@@ -130,15 +127,15 @@ def summarize_views(views: Sequence[dict[str, float]]) -> dict[str, Any]:
 
 
 def compute_statistic(views: Sequence[dict[str, float]], statistic: Callable[..., float], key: str) -> float | None:
-    """A statistic over the views that have a finite figure; None where no view has."""
+    """Statistic of a metric over the views where it is finite; None if there are none."""
     values = [view[key] for view in views if math.isfinite(view[key])]
     return round(statistic(values), 4) if values else None
 
 
 def get_peak_memory_bytes(device: torch.device) -> int:
-    """The most memory this process has held so far.
+    """Peak memory of this process.
 
-    On CUDA, the peak of its tensors on the device; on MPS, which keeps no such count, what its driver holds now.
+    On CUDA, the peak of its tensors on the device; on MPS, which counts no peak, what its driver holds now.
     """
     if device.type == "cuda":
         return torch.cuda.max_memory_allocated(device)

@@ -1,4 +1,4 @@
-"""LiveViewer: the field in the browser while it trains."""
+"""Live viewer: the field in the browser while it trains."""
 
 import time
 from typing import TYPE_CHECKING, Annotated, Any
@@ -18,22 +18,22 @@ if TYPE_CHECKING:
     from nerf_lightning.view.field_page import FieldPage
 
 MAX_IMAGE_SIDE, MAX_IMAGE_SECONDS = 512, 0.06
-"""Of an image: pixels along its longer side, and the time that it may take."""
+"""Longer side of an image in pixels, and its render seconds."""
 
 
 class LiveViewer(L.Callback):
-    """Serves a page that shows the field between training steps, with the training clock stopped, and how far training is.
+    """Serves a page that shows the field and its progress between training steps, with the training clock stopped.
 
-    It draws only while somebody is looking, and for at most a share of the time. When training is done, the page stays open
-    as long as a browser shows it.
+    It renders only while a browser is connected, for at most a fraction of the time. After training, the page stays open as
+    long as a browser shows it.
 
     Args:
         host: address to listen on; 0.0.0.0 shares the page with the network.
         port: the next free one if it is in use; 0 for any.
-        max_time_fraction: of the time that drawing may take.
+        max_time_fraction: fraction of the time that rendering may take.
 
     Raises:
-        InputError: at the start of training, if it is an image's, Viser is not installed, or the address does not exist.
+        InputError: at the start of training, for a 2D field, without Viser, or if the address does not exist.
     """
 
     def __init__(
@@ -46,10 +46,10 @@ class LiveViewer(L.Callback):
         self.port = port
         self.max_time_fraction = max_time_fraction
         self.page: FieldPage | None = None
-        self._next_draw = 0.0  # when drawing may take time again, by `time.perf_counter`
+        self._next_draw = 0.0  # earliest time of the next image, by `time.perf_counter`
 
     def check(self, data: DataModule) -> None:
-        """Called before a run writes anything."""
+        """Checks the data, before a run writes anything."""
         if not data.is_posed:
             raise InputError("config", "callbacks", "live needs a scene", hint="pictures have training.gif")
         require_viser()
@@ -84,11 +84,11 @@ class LiveViewer(L.Callback):
             self.page.render_next(MAX_IMAGE_SECONDS)
 
     def finish(self, psnr: float | None, keep_open: bool) -> None:
-        """Ends the page, called when all is written.
+        """Closes the page, after a run has written everything.
 
         Args:
-            psnr: held out, dB.
-            keep_open: whether to serve the finished field until no browser shows it any more.
+            psnr: held-out PSNR in dB.
+            keep_open: whether to serve the trained field until no browser shows it.
         """
         if self.page is None:
             return

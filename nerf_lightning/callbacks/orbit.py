@@ -1,4 +1,4 @@
-"""Orbit: a turn around the subject as an animated GIF."""
+"""Orbit: an animated GIF of a camera path around the subject."""
 
 import math
 from collections.abc import Iterator
@@ -20,30 +20,29 @@ from nerf_lightning.utils.option_checks import FramesPerSecond, Ge
 from nerf_lightning.utils.text import subsample
 
 ORBIT_FILE = "orbit.gif"
-"""Below the run folder."""
 MAX_FRAME_SIDE = 800
-"""Longer one of a frame, in pixels."""
+"""Longer side of a frame, in pixels."""
 
 
 class Orbit(RenderingCallback):
     """Renders the scene's orbit after the test.
 
     Args:
-        frames: how many of the orbit's views, evenly chosen, of at most `MAX_FRAME_SIDE` pixels, or smaller if there is no time
-            for them (see `RenderingCallback`); 0 makes no GIF.
-        fps: frames a second.
+        frames: views of the orbit, evenly spaced, of at most `MAX_FRAME_SIDE` pixels, smaller where time is short (see
+            `RenderingCallback`); 0 makes no GIF.
+        fps: frames per second.
     """
 
     def __init__(self, frames: Annotated[int, Ge(0)] = 60, fps: FramesPerSecond = 20):
         self.frames = frames
         self.fps = fps
-        self._done_fraction = 0.0  # share of the frames
+        self._done_fraction = 0.0  # of the frames
 
     def count_remaining_pixels(self, trainer: L.Trainer) -> float:
         return float(self.select_cameras(trainer).sizes.prod(1).sum()) * (1 - self._done_fraction)
 
     def select_cameras(self, trainer: L.Trainer) -> Cameras:
-        """Of the frames, at the size for which there may be time."""
+        """Cameras of the frames, at full size."""
         orbit = get_datamodule(trainer).scene.orbit
         chosen = orbit[torch.tensor(subsample(len(orbit), self.frames)).long()]
         return chosen.rescale(min(1.0, MAX_FRAME_SIDE / orbit.max_side))
@@ -65,10 +64,8 @@ class Orbit(RenderingCallback):
     def _render_frames(
         self, trainer: L.Trainer, system: NeRF3D, cameras: Cameras
     ) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
-        render_timer, caption = (
-            Budget.find(trainer).render_timer,
-            f"{get_datamodule(trainer).scene.name}, step {trainer.global_step}",
-        )
+        render_timer = Budget.find(trainer).render_timer
+        caption = f"{get_datamodule(trainer).scene.name}, step {trainer.global_step}"
         for view in range(len(cameras)):
             before = render_timer.seconds
             with render_timer.measure(f"orbit, frame {view + 1} of {len(cameras)}"):

@@ -1,7 +1,8 @@
-"""What a 2D run leaves beside its figures: charts, a GIF, and comparisons with JPEG and bicubic interpolation."""
+"""Report of a 2D run: charts, a GIF, and comparisons with JPEG and bicubic interpolation."""
 
 import math
 from itertools import product
+from operator import itemgetter
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,13 +27,13 @@ from nerf_lightning.utils.option_checks import Count, FramesPerSecond, Gt, Le
 
 Image = UInt8[np.ndarray, "H W 3"]
 JPEG_QUALITIES = (*range(5, 90, 5), *range(90, 101))
-"""Of the JPEGs that are tried: bytes grow fastest near 100."""
+"""Qualities compared: bytes grow fastest near 100."""
 CHROMA_SUBSAMPLINGS = (cv2.IMWRITE_JPEG_SAMPLING_FACTOR_420, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444)
-"""Colours at half resolution, and at full."""
+"""Chroma at half resolution, and at full."""
 
 
 def plot_error_map(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], title: str) -> Figure:
-    """The error of every pixel, averaged over the colours, with a colour bar."""
+    """Plots the error of every pixel, averaged over the channels."""
     error = (rgb - truth).abs_().mean(-1).mul_(255).numpy()
     height, width = error.shape
     figure = Figure(figsize=(8, 1 + 7 * min(max(height / width, 0.2), 3)), dpi=DPI, layout="constrained")
@@ -47,7 +48,7 @@ def plot_error_map(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], t
 
 
 def plot_psnr_curve(curve: list[list[float]], title: str) -> Figure:
-    """PSNR over training seconds and over steps."""
+    """Plots PSNR over training seconds and over steps."""
     figure = Figure(figsize=(12, 4.5), dpi=DPI, layout="constrained")
     for axes, column, label in zip(figure.subplots(1, 2), (0, 1), ("training seconds", "step"), strict=True):
         points = [(p[column], p[2]) for p in curve if p[column] > 0]  # on a logarithmic axis
@@ -61,12 +62,13 @@ def plot_psnr_curve(curve: list[list[float]], title: str) -> Figure:
 
 
 class PictureReport(L.Callback):
-    """After the test, writes error.png, spectrum.png and curve.png; training.gif of the snapshots, where there are any; and
-    baselines.json, which compares the field with a JPEG and with a shrunk picture of the same bytes.
+    """Writes error.png, spectrum.png, curve.png, training.gif of the snapshots, and baselines.json after the test.
+
+    baselines.json compares the field with a JPEG and with a downsampled picture of the same bytes.
 
     Args:
-        fps: frames a second of training.gif; the last one stays for three.
-        width: most pixels across; wider snapshots are shrunk.
+        fps: frames per second of training.gif; the last one is shown three times.
+        width: most pixels across; wider snapshots are downsampled.
     """
 
     def __init__(self, fps: FramesPerSecond = 3, width: Count = 640):
@@ -85,17 +87,17 @@ class PictureReport(L.Callback):
         write_png(folder / "curve.png", rasterize_figure(plot_psnr_curve(collect_quality_curve(trainer), title)))
         if files := sorted((folder / SNAPSHOT_FOLDER).glob("step_*.png")):
             self.write_gif(files, folder / "training.gif")
-        found = compare_with_jpeg(data.scene.image.numpy(), count_artifact_bytes(pl_module))
-        write_json(folder / "baselines.json", nan_to_none({**found, "field": round(result.psnr, 4)}))
-        jpeg = "none that small" if found["jpeg"] is None else format_psnr(found["jpeg"]["psnr"])
-        bicubic = format_psnr(found["bicubic"]["psnr"])
-        print(f"in {found['bytes'] / 1e3:,.1f} kB: JPEG {jpeg}; shrunk and enlarged by bicubic interpolation {bicubic}")
+        comparison = compare_with_jpeg(data.scene.image.numpy(), count_artifact_bytes(pl_module))
+        write_json(folder / "baselines.json", nan_to_none({**comparison, "field": round(result.psnr, 4)}))
+        jpeg = "none that small" if comparison["jpeg"] is None else format_psnr(comparison["jpeg"]["psnr"])
+        size, bicubic = comparison["bytes"] / 1e3, format_psnr(comparison["bicubic"]["psnr"])
+        print(f"in {size:,.1f} kB: JPEG {jpeg}; downsampled and enlarged by bicubic interpolation {bicubic}")
 
     def write_gif(self, files: list[Path], target: Path) -> None:
-        """Makes an animation of pictures at the size of the last."""
+        """Writes an animation of image files, at the size of the last."""
         height, width, _ = limit_width(imageio.imread(files[-1]), self.width).shape
         pictures = (imageio.imread(file) for file in [*files, files[-1], files[-1]])
-        frames = (cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA) for one in pictures)
+        frames = (cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA) for image in pictures)
         with atomic_write(target) as temporary:
             write_animation(temporary, frames, 1 / self.fps)
 
@@ -110,38 +112,38 @@ def format_psnr(psnr_db: float) -> str:
 
 
 def encode_jpegs(image: Image) -> list[dict[str, Any]]:
-    """Quality, size in bytes and PSNR of JPEGs of a picture."""
-    found, bgr = [], np.ascontiguousarray(image[..., ::-1])
+    """Quality, size in bytes and PSNR of JPEGs of an image."""
+    jpegs, bgr = [], np.ascontiguousarray(image[..., ::-1])
     for quality, sampling in product(JPEG_QUALITIES, CHROMA_SUBSAMPLINGS):
         options = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_SAMPLING_FACTOR, sampling]
-        _, coded = cv2.imencode(".jpg", bgr, options)
-        decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+        _, encoded = cv2.imencode(".jpg", bgr, options)
+        decoded = cv2.imdecode(encoded, cv2.IMREAD_COLOR)
         assert decoded is not None  # encoded one line above
-        found.append({"quality": quality, "bytes": len(coded), "psnr": compute_psnr(decoded, bgr)})
-    return found
+        jpegs.append({"quality": quality, "bytes": len(encoded), "psnr": compute_psnr(decoded, bgr)})
+    return jpegs
 
 
 def downsample_to_bytes(image: Image, max_bytes: int) -> dict[str, Any]:
-    """The picture shrunk to `max_bytes` bytes at three bytes a pixel, then enlarged again by bicubic interpolation."""
+    """Downsamples an image to `max_bytes` at three bytes per pixel, then enlarges it by bicubic interpolation."""
     height, width = image.shape[:2]
     scale = min(1.0, (max_bytes / image.nbytes) ** 0.5)
-    small = (max(1, int(width * scale)), max(1, int(height * scale)))
-    less = cv2.resize(image, small, interpolation=cv2.INTER_AREA)
-    back = cv2.resize(less, (width, height), interpolation=cv2.INTER_CUBIC)
-    return {"width": small[0], "height": small[1], "bytes": less.nbytes, "psnr": compute_psnr(back, image)}
+    size = (max(1, int(width * scale)), max(1, int(height * scale)))
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    enlarged = cv2.resize(small, (width, height), interpolation=cv2.INTER_CUBIC)
+    return {"width": size[0], "height": size[1], "bytes": small.nbytes, "psnr": compute_psnr(enlarged, image)}
 
 
 def compare_with_jpeg(image: Image, size: int) -> dict[str, Any]:
-    """The best JPEG of at most so many bytes, None where none is that small, and the picture shrunk to them."""
-    fitting = [one for one in encode_jpegs(image) if one["bytes"] <= size]
-    best = max(fitting, key=lambda one: one["psnr"], default=None)
+    """Best JPEG of at most `size` bytes, None if none is that small, and the image downsampled to them."""
+    candidates = [jpeg for jpeg in encode_jpegs(image) if jpeg["bytes"] <= size]
+    best = max(candidates, key=itemgetter("psnr"), default=None)
     return {"bytes": size, "picture_bytes": image.nbytes, "jpeg": best, "bicubic": downsample_to_bytes(image, size)}
 
 
 class PictureUpscaling(L.Callback):
-    """Renders a 2D field at another scale after the test: enlarged.png alone, enlarged_panel.png beside bicubic.
+    """Renders a 2D field at another scale after the test: enlarged.png, and enlarged_panel.png next to bicubic.
 
-    If the picture was shrunk for training (`dataset.max_side`) or is the built-in one, the true larger picture is known, and
+    If the picture was downsampled for training (`dataset.max_side`) or is the built-in one, its larger original is known, and
     both are compared with it: printed, and in enlarged.json.
 
     Args:

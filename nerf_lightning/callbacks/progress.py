@@ -1,4 +1,4 @@
-"""ProgressBar: a bar with quality, speed, the time left and what is being rendered."""
+"""Progress bar: PSNR, speed, time left, and what is being rendered."""
 
 import time
 from functools import partial
@@ -16,34 +16,23 @@ from nerf_lightning.system import System
 from nerf_lightning.utils.progress import format_duration, is_interactive
 
 MIN_ETA_SECONDS = 10.0
-"""Of training, before which nobody can tell how long the rest takes: an early field is full of fog."""
+"""Training seconds before the time left is shown: an early field is fog, which renders slowly."""
 BAR_UPDATE_SECONDS = 0.5
-"""Between two updates of the bar."""
 
 
 def estimate_seconds_left(trainer: L.Trainer) -> float | None:
-    """Seconds to the end of the run: the rest of the budget, and the rendering still to come at the speed of the last views.
-
-    None while they cannot be told.
-    """
+    """Seconds to the end of the run, remaining rendering at the current speed included; None while unknown."""
     budget = Budget.find(trainer)
-    training = budget.seconds_left(trainer.global_step)
-    if (
-        training is None
-        or budget.render_timer.seconds_per_pixel is None
-        or (training and budget.seconds < MIN_ETA_SECONDS)
-    ):
+    training, is_early = budget.seconds_left(trainer.global_step), budget.seconds < MIN_ETA_SECONDS
+    if training is None or budget.render_timer.seconds_per_pixel is None or (training and is_early):
         return None
     return training + sum(allocate_render_seconds(trainer).values())
 
 
 def describe_progress(trainer: L.Trainer) -> list[str]:
-    """The step, the held-out dB, the time left, and what is being rendered, as far as they are known."""
-    validation, seconds, subject = (
-        find_callback(trainer, PeriodicValidation),
-        estimate_seconds_left(trainer),
-        Budget.find(trainer).render_timer.subject,
-    )
+    """Parts of a status line, as far as known: step, held-out PSNR, time left, and what is being rendered."""
+    validation = find_callback(trainer, PeriodicValidation)
+    seconds, subject = estimate_seconds_left(trainer), Budget.find(trainer).render_timer.subject
     parts = [f"step {trainer.global_step}"]
     if validation is not None and validation.latest_psnr is not None:
         parts.append(f"held out {validation.latest_psnr:.2f} dB")
@@ -52,10 +41,10 @@ def describe_progress(trainer: L.Trainer) -> list[str]:
 
 
 class ProgressBar(L.Callback):
-    """Shows how far the run is: a bar on a terminal or in a notebook (with ipywidgets), elsewhere a line from time to time.
+    """Shows the run's progress: a bar in a terminal or notebook (with ipywidgets), elsewhere a line at intervals.
 
     Args:
-        every_seconds: between lines, when there is no bar.
+        every_seconds: between lines, without a bar.
     """
 
     def __init__(self, every_seconds: float = 15):
@@ -63,7 +52,7 @@ class ProgressBar(L.Callback):
         self.console = Console()
         self.bar: RichProgress | None = None
         self._last_shown = 0.0
-        self._mark_seconds, self._rays_since_mark = 0.0, 0  # seconds of training when a speed was shown, and rays since
+        self._mark_seconds, self._rays_since_mark = 0.0, 0  # training seconds at the last speed shown, and rays since
 
     def open(self, name: str) -> None:
         if is_interactive(self.console) and not self.console.quiet:
@@ -74,10 +63,9 @@ class ProgressBar(L.Callback):
             self.bar.add_task(name, total=1.0, status="")
 
     def show(self, trainer: L.Trainer, system: System, force: bool = False) -> None:
-        """Shows how far the run is, rendering included, if it is time for that, or `force`."""
-        if not force and time.monotonic() - self._last_shown < (
-            self.every_seconds if self.bar is None else BAR_UPDATE_SECONDS
-        ):
+        """Shows the run's progress, rendering included, if an update is due, or `force`."""
+        interval = self.every_seconds if self.bar is None else BAR_UPDATE_SECONDS
+        if not force and time.monotonic() - self._last_shown < interval:
             return
         self._last_shown = time.monotonic()
         seconds, budget, parts = estimate_seconds_left(trainer), Budget.find(trainer), describe_progress(trainer)

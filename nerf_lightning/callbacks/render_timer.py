@@ -1,4 +1,4 @@
-"""Rendering beside training: it takes no longer than training does, and its end can be told."""
+"""Render timing: limits rendering to the training time, and predicts when it ends."""
 
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -6,24 +6,24 @@ from contextlib import contextmanager
 from typing import TypeVar
 
 MIN_RENDER_SECONDS = 30.0
-"""Rendering may always take this long, however short the training is."""
+"""Rendering time that is always allowed, however short the training."""
 MIN_RENDER_FRACTION = 0.01
-"""Of its pixels, that each job renders however little time there is."""
+"""Fraction of its pixels that each job may always render."""
 EMA_WEIGHT = 0.7
-"""Weight of the last view in the seconds that a pixel takes."""
+"""Weight of the last view in the running mean of seconds per pixel."""
 PROBE_PIXELS = 1 << 14
-"""Pixels whose time tells what others take; fewer count less."""
+"""Pixels of a timing probe; smaller renders get less weight."""
 Job = TypeVar("Job")
 
 
 def allocate_max_min_fair(
     costs: Mapping[Job, float], weights: Mapping[Job, float], allowance: float
 ) -> dict[Job, float]:
-    """Weighted max-min fair shares: no job gets more than it costs, and what it leaves is divided among the others.
+    """Weighted max-min fair shares: no job gets more than its cost; what it leaves is divided among the others.
 
     Args:
-        costs, weights: seconds of each job, and its weight.
-        allowance: seconds for all of them; each gets `MIN_RENDER_FRACTION` of its own in any case.
+        costs, weights: seconds and weight of each job.
+        allowance: seconds for all jobs; each gets `MIN_RENDER_FRACTION` of its cost in any case.
     """
     shares: dict[Job, float] = {}
     rest = max(0.0, allowance - MIN_RENDER_FRACTION * sum(costs.values()))
@@ -36,24 +36,22 @@ def allocate_max_min_fair(
 
 
 class RenderTimer:
-    """Counts the time of rendering, measures what a pixel takes, and says what is being rendered."""
+    """Times rendering, tracks the seconds per pixel, and names what is being rendered."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
-        """Seconds of rendering so far."""
         self.seconds_per_pixel: float | None = None
-        """Of rendering; None before the first view."""
+        """Running mean; None before the first view."""
         self.subject = ""
-        """What is being rendered."""
         self._listener: Callable[[], None] = lambda: None
 
     def subscribe(self, listener: Callable[[], None]) -> None:
-        """Calls it whenever something else is being rendered."""
+        """Calls `listener` whenever the subject changes."""
         self._listener = listener
 
     @contextmanager
     def measure(self, subject: str) -> Iterator[None]:
-        """Counts the time of a block as rendering."""
+        """Times a block as rendering."""
         self.start(subject)
         try:
             yield
@@ -61,7 +59,7 @@ class RenderTimer:
             self.stop()
 
     def start(self, subject: str) -> None:
-        """The same where the block is not one."""
+        """Starts timing, where `measure` does not fit."""
         self.subject, self._since = subject, time.perf_counter()
         self._listener()
 
@@ -70,7 +68,7 @@ class RenderTimer:
         self.subject = ""
 
     def add_timing(self, pixels: int, seconds: float) -> None:
-        """Called with the time that a view took."""
+        """Updates the seconds per pixel with a rendered view."""
         each, weight = seconds / pixels, EMA_WEIGHT * min(1.0, pixels / PROBE_PIXELS)
         self.seconds_per_pixel = (
             each if self.seconds_per_pixel is None else (1 - weight) * self.seconds_per_pixel + weight * each

@@ -1,4 +1,4 @@
-"""results.json: everything a comparison needs to know about a run."""
+"""results.json: metrics and metadata of a run, for comparisons."""
 
 import math
 import platform
@@ -24,13 +24,13 @@ from nerf_lightning.utils.files import nan_to_none
 from nerf_lightning.utils.machine import describe_machine
 
 MIN_GAIN_DB = 1.0
-"""A run has learned nothing if it is less than this many dB better than one plain colour ..."""
+"""A run has learned nothing if it is less than this many dB better than a constant colour ..."""
 TRIVIAL_SCENE_DB = 40.0
-"""... unless it reaches this many dB: then one colour may be all there is to learn."""
+"""... unless it reaches this PSNR: then one colour may be all there is to learn."""
 OVERFIT_GAP_DB = 8.0
-"""A field has learned its photos rather than the scene if held-out views are this many dB worse than training photos ..."""
+"""A field overfits its photos if held-out views are this many dB worse than training photos ..."""
 GOOD_PSNR_DB = 30.0
-"""... unless they reach this many dB: then there is little to improve."""
+"""... unless they reach this PSNR: then there is little to improve."""
 
 
 def summarize_run(
@@ -41,14 +41,14 @@ def summarize_run(
     warnings: Sequence[str],
     error: BaseException | None = None,
 ) -> dict[str, Any]:
-    """The content of results.json, with null for what was not measured.
+    """Content of results.json, with null for what was not measured.
 
     Args:
         trainer: after its test, or with an error.
-        system: that it has trained.
+        system: the trained system.
         method: name of the model, as configured.
         seed: of the run.
-        warnings: what was doubtful about the data before training began.
+        warnings: issues found in the data before training.
         error: what ended the run early.
     """
     device, budget = trainer.strategy.root_device, Budget.find(trainer)
@@ -63,7 +63,7 @@ def summarize_run(
         "device": str(device),
         "threads": torch.get_num_threads(),
         "machine": describe_machine(device),
-        # Several processes would count each other as other work.
+        # Several processes would count each other as background load.
         "load": budget.state.clock.load.average_cores() if trainer.world_size == 1 else None,
         "versions": {
             "python": platform.python_version(),
@@ -82,7 +82,7 @@ def summarize_run(
         "warnings": list(warnings),
         "plateau": budget.final_plateau,
         "corrections": summarize_corrections(corrections) if corrections and corrections.is_finite else None,
-        "recoveries": [asdict(one) for one in recovery.recoveries] if recovery is not None else [],
+        "recoveries": [asdict(restart) for restart in recovery.recoveries] if recovery is not None else [],
         "status": status,
         "diagnosis": diagnosis,
     }
@@ -100,19 +100,16 @@ def diagnose_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> 
     """Status and diagnosis of a run that was trained and tested."""
     if name := next((name for name, value in system.named_parameters() if not value.isfinite().all()), None):
         return "collapsed", f"{name} is no longer finite"
-    counted = [view for view in evaluation.view_metrics if math.isfinite(view["psnr"])]
-    if not counted:
-        return "collapsed", "no figure of held-out views: what is rendered is not finite, or no pixel is known"
-    held_out_psnr, constant_color_psnr = (
-        fmean(view[key] for view in counted) for key in ("psnr", "constant_color_psnr")
-    )
-    view, min_useful_psnr = (
-        get_datamodule(trainer).get_held_out_view(0).to(system.device),
-        min(constant_color_psnr + MIN_GAIN_DB, TRIVIAL_SCENE_DB),
-    )
+    finite_views = [view for view in evaluation.view_metrics if math.isfinite(view["psnr"])]
+    if not finite_views:
+        return "collapsed", "no PSNR of held-out views: their renders are not finite, or no pixel is known"
+    held_out_psnr = fmean(view["psnr"] for view in finite_views)
+    constant_color_psnr = fmean(view["constant_color_psnr"] for view in finite_views)
+    min_useful_psnr = min(constant_color_psnr + MIN_GAIN_DB, TRIVIAL_SCENE_DB)
+    view = get_datamodule(trainer).get_held_out_view(0).to(system.device)
     if held_out_psnr < min_useful_psnr:
         diagnosis = (
-            f"held-out PSNR {held_out_psnr:.2f} dB is no better than one plain colour ({constant_color_psnr:.2f} dB)"
+            f"held-out PSNR {held_out_psnr:.2f} dB is no better than a constant colour ({constant_color_psnr:.2f} dB)"
         )
         return "collapsed", ": ".join(filter(None, (diagnosis, system.diagnose(view))))
     status = "stopped_early" if Budget.find(trainer).progress(trainer.global_step) < 1.0 else "finished"
@@ -125,14 +122,14 @@ def diagnose_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> 
     off_grid_psnr = system.measure_off_grid_psnr(view)
     if off_grid_psnr is not None and off_grid_psnr < min_useful_psnr:
         return status, (
-            f"between its pixels the field is no better than one plain colour ({off_grid_psnr:.1f} dB):"
+            f"off the pixel grid the field is no better than a constant colour ({off_grid_psnr:.1f} dB):"
             " it holds frequencies that the pixels do not show"
         )
     return status, ""
 
 
 def collect_quality_curve(trainer: L.Trainer) -> list[list[float]]:
-    """[training seconds, step, PSNR] at each measurement, and at the end."""
+    """Quality curve: [training seconds, step, PSNR] at each validation and at the end."""
     validation, evaluation = find_callback(trainer, PeriodicValidation), find_callback(trainer, Evaluation)
     final = evaluation.metrics["psnr"] if evaluation is not None else None
     end = [] if final is None else [[round(Budget.find(trainer).seconds, 3), trainer.global_step, final]]
@@ -140,5 +137,5 @@ def collect_quality_curve(trainer: L.Trainer) -> list[list[float]]:
 
 
 def count_artifact_bytes(system: System) -> int:
-    """Of all weights and buffers."""
+    """Size in bytes of all weights and buffers."""
     return sum(tensor.numel() * tensor.element_size() for tensor in system.state_dict().values())

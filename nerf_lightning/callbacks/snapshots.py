@@ -1,4 +1,4 @@
-"""Snapshots: what the field looks like along the way."""
+"""Snapshots: renders of a held-out view during training."""
 
 from itertools import count, takewhile
 from pathlib import Path
@@ -16,20 +16,20 @@ from nerf_lightning.system import System
 from nerf_lightning.utils.option_checks import Count
 
 MAX_LOGGED_WIDTH = 640
-"""Widest picture for TensorBoard, in pixels: it takes 0.1 s for each megabyte."""
+"""Most pixels across of an image for TensorBoard, which takes 0.1 s per megabyte."""
 SNAPSHOT_FOLDER, FINAL_FILE, TRUTH_FILE = "snapshots", "final.png", "truth.png"
-"""Below the run folder: all snapshots, the latest render alone, and what it should look like, which is written once."""
+"""Inside the run folder: all snapshots, the latest render, and its ground truth."""
 
 
 class Snapshots(RenderingCallback):
-    """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, and once more at the end.
+    """Writes truth, render and depth of one held-out view as PNG and to TensorBoard, also at the end.
 
     Of views beyond `max_pixels`, and where time is short (see `RenderingCallback`), every n-th row and column is rendered.
 
     Args:
         steps: after which steps; None means 10, 20, 50, 100, 200, 500, ...
         view: index of the held-out view.
-        max_pixels: of a snapshot, which is for looking at; None takes all.
+        max_pixels: of a snapshot; None takes all.
 
     Raises:
         InputError: from `check`, if there is no such view.
@@ -39,17 +39,17 @@ class Snapshots(RenderingCallback):
         self.steps = steps
         self.view = view
         self.max_pixels = max_pixels
-        self._last_written_step: int | None = None  # the step of the latest
+        self._last_written_step: int | None = None
 
     def list_snapshot_steps(self, last: float) -> list[int]:
-        """The steps after which there is a snapshot, up to the `last`."""
+        """Steps after which there is a snapshot, up to `last`."""
         if self.steps is not None:
             return [step for step in self.steps if step <= last]
         spaced = (digit * 10**power for power in count(1) for digit in (1, 2, 5))
         return list(takewhile(lambda step: step <= last, spaced))
 
     def check(self, data: DataModule) -> None:
-        """Called before a run writes anything."""
+        """Checks the view's index, before a run writes anything."""
         views = data.num_held_out_views
         if not 0 <= self.view < views:
             raise InputError("callbacks.snapshots.view", "", str(self.view), f"a held-out view from 0 to {views - 1}")
@@ -57,15 +57,11 @@ class Snapshots(RenderingCallback):
     def count_remaining_pixels(self, trainer: L.Trainer) -> float:
         step, progress = trainer.global_step, Budget.find(trainer).progress(trainer.global_step)
         last = step / progress if progress else step
-        left = {
-            one
-            for one in (*self.list_snapshot_steps(last), round(last))
-            if one >= step and one != self._last_written_step
-        }
-        return len(left) * self.count_pixels(trainer)
+        steps = {*self.list_snapshot_steps(last), round(last)} - {self._last_written_step}
+        return sum(due >= step for due in steps) * self.count_pixels(trainer)
 
     def count_pixels(self, trainer: L.Trainer) -> int:
-        """Of a snapshot for which there is time."""
+        """Pixels of a snapshot at full size."""
         pixels = get_datamodule(trainer).count_held_out_pixels(self.view)
         return min(pixels, self.max_pixels or pixels)
 
@@ -80,7 +76,7 @@ class Snapshots(RenderingCallback):
             (result,) = pl_module.evaluate_held_out(data, [self.view], subset)
         budget.render_timer.add_timing(result.num_pixels, result.seconds)
         self._last_written_step = step
-        with budget.pause():  # not `pause_to_render`: a signal may not break what others write on
+        with budget.pause():  # not `pause_to_render`: a signal must not interrupt writing
             caption = f"{data.scene.name}, step {step}, {budget.seconds:.0f} s, {result.psnr:.2f} dB"
             picture = make_result_panel(result, caption)
             write_png(folder / SNAPSHOT_FOLDER / f"step_{step:07d}.png", picture)

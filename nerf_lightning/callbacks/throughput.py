@@ -1,4 +1,4 @@
-"""Throughput: loss, learning rate and speed to the log."""
+"""Throughput: logs losses, learning rates and training speed."""
 
 from typing import Any
 
@@ -9,16 +9,16 @@ from nerf_lightning.system import System, mse_to_psnr
 from nerf_lightning.utils.option_checks import Count
 
 TRAIN_SECONDS_KEY = "speed/train_seconds"
-"""The time that a step's figures belong to, logged with them."""
+"""Training seconds of a step's metrics, logged with them."""
 
 
 class Throughput(L.Callback):
-    """Logs the terms of the loss, PSNR of the batch, learning rates, rays a second and samples a ray, every `every` steps.
+    """Logs loss terms, batch PSNR, learning rates, rays per second and samples per ray, every `every` steps.
 
-    Lightning's `ThroughputMonitor` knows neither a clock that stops nor rays.
+    Lightning's `ThroughputMonitor` supports neither a clock that pauses nor rays.
 
     Args:
-        every: steps between log entries; the speeds are averages over them.
+        every: steps between log entries, over which the speeds are averaged.
     """
 
     def __init__(self, every: Count = 20):

@@ -1,4 +1,4 @@
-"""What a callback finds on its trainer. Lightning sets these at run time, so type checkers do not know them."""
+"""Typed access to a trainer's callbacks and data module, which Lightning sets at run time."""
 
 from typing import TypeVar
 
@@ -11,15 +11,14 @@ ValueT = TypeVar("ValueT")
 
 
 def find_callback(trainer: L.Trainer, kind: type[CallbackT]) -> CallbackT | None:
-    """The trainer's callback of a kind, or None."""
+    """Finds the trainer's callback of a class; None without one."""
     return next((callback for callback in trainer.callbacks if isinstance(callback, kind)), None)  # type: ignore[attr-defined]
 
 
 def get_datamodule(trainer: L.Trainer) -> DataModule:
-    """The data module of the run."""
     return trainer.datamodule  # type: ignore[attr-defined]
 
 
 def broadcast_from_rank_zero(trainer: L.Trainer, value: ValueT) -> ValueT:
-    """The first process's value in all processes of a run: clocks differ, and all must decide the same."""
+    """The first process's value in all processes of a run: clocks differ, and all must decide alike."""
     return trainer.strategy.broadcast(value) if trainer.world_size > 1 else value

@@ -1,4 +1,4 @@
-"""PeriodicValidation: the quality curve, on views that are never trained on."""
+"""Periodic validation: the curve of held-out PSNR over training."""
 
 from statistics import fmean
 from typing import Annotated, Any
@@ -19,25 +19,25 @@ from nerf_lightning.utils.text import subsample
 class PeriodicValidation(RenderingCallback):
     """Measures held-out PSNR at fractions of the budget, with the training clock stopped.
 
-    The last point of the curve, at the end of the budget, comes from the `Evaluation` of all views. Where rendering would take
-    longer than training (see `RenderingCallback`), the others are measured on every n-th row and column.
+    `Evaluation` adds the last point of the curve, on all views. Where rendering would take longer than training (see
+    `RenderingCallback`), every n-th row and column is measured.
 
     Args:
-        fractions: parts of the budget.
-        views: how many held-out views, evenly chosen; None takes all.
+        fractions: of the budget.
+        views: number of held-out views, evenly spaced; None takes all.
     """
 
     def __init__(self, fractions: list[Annotated[float, Gt(0), Lt(1)]], views: Count | None = None):
         self.fractions = fractions
         self.views = views
         self.curve: list[list[float]] = []
-        """[training seconds, step, PSNR], a row for each measurement that has a figure."""
+        """[training seconds, step, PSNR], a row for each measurement that is finite."""
         self.num_measured = 0
-        """How many of them were passed when it was measured last."""
+        """Fractions passed at the last measurement."""
 
     @property
     def latest_psnr(self) -> float | None:
-        """The last PSNR, or None before the first."""
+        """Last PSNR; None before the first."""
         return self.curve[-1][2] if self.curve else None
 
     def count_remaining_pixels(self, trainer: L.Trainer) -> float:
@@ -49,31 +49,28 @@ class PeriodicValidation(RenderingCallback):
         passed = sum(pl_module.state.progress >= fraction for fraction in self.fractions)
         if passed <= self.num_measured or pl_module.state.progress >= 1.0:
             return
-        measure_held_out_psnr, seconds = self.measure(trainer, pl_module), Budget.find(trainer).seconds
+        psnr, seconds = self.measure(trainer, pl_module), Budget.find(trainer).seconds
         self.num_measured = passed
-        if measure_held_out_psnr is None:
+        if psnr is None:
             return
-        self.curve.append([round(seconds, 3), trainer.global_step, measure_held_out_psnr])
+        self.curve.append([round(seconds, 3), trainer.global_step, psnr])
         if trainer.logger is not None:
-            trainer.logger.log_metrics(
-                {"val/psnr": measure_held_out_psnr, TRAIN_SECONDS_KEY: seconds}, trainer.global_step
-            )
+            trainer.logger.log_metrics({"val/psnr": psnr, TRAIN_SECONDS_KEY: seconds}, trainer.global_step)
 
     def measure(self, trainer: L.Trainer, pl_module: System) -> float | None:
-        """Mean PSNR of the views; those of which no pixel is known do not count."""
+        """Mean PSNR of the views that have known pixels."""
         data, budget = get_datamodule(trainer), Budget.find(trainer)
         chosen = subsample(data.num_held_out_views, self.views)
         pixels = fmean(map(data.count_held_out_pixels, chosen))
-        subset = make_subset(
-            pixels, broadcast_from_rank_zero(trainer, self.compute_affordable_fraction(trainer, pl_module)) * pixels
-        )
-        views = []  # not their pictures, which would be held together
+        fraction = broadcast_from_rank_zero(trainer, self.compute_affordable_fraction(trainer, pl_module))
+        subset = make_subset(pixels, fraction * pixels)
+        views = []  # metrics alone, so that one image is in memory at a time
         for number, view in enumerate(chosen, 1):
             with budget.pause_to_render(trainer, f"held-out view {number} of {len(chosen)}"):
                 (result,) = pl_module.evaluate_held_out(data, [view], subset)
             budget.render_timer.add_timing(result.num_pixels, result.seconds)
             views.append({"psnr": result.psnr})
-            if trainer.world_size == 1:  # several processes leave together, at the end of a step
+            if trainer.world_size == 1:  # several processes stop together, at the end of a step
                 raise_if_signalled()
         return compute_statistic(views, fmean, "psnr")
 

@@ -1,4 +1,4 @@
-"""Stage 1, cameras: pixels -> Rays, and the Bounds of the content along them."""
+"""Cameras: pixels -> Rays, and the Bounds of the scene along them."""
 
 from nerf_lightning.cameras.bounds import BoundedModule, Bounds
 from nerf_lightning.cameras.camera_layout import CameraLayout, classify_layout

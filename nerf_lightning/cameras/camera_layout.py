@@ -1,4 +1,4 @@
-"""How a capture's cameras are laid out: around a subject, on one side of it, turning on a spot, or along a walk."""
+"""Camera layouts: inward-facing, forward-facing, a pan, or a walk; and the point that cameras look at."""
 
 from enum import StrEnum
 
@@ -12,41 +12,41 @@ from torch.nn.functional import normalize
 MAX_FORWARD_VARIANCE = 0.1
 """Largest circular variance (1 - length of the mean axis) of forward-facing cameras: axes within about 35 degrees."""
 MIN_CONVERGENCE = 0.4
-"""See `find_convergence`: 1 where all look at a point, 0 or less where they might look in one direction."""
+"""Lowest score of `find_convergence`: 1 if all axes meet, 0 or less if one direction explains them as well."""
 MAX_PARALLEL_VARIANCE = 1e-5
-"""Circular variance below which axes are parallel: within a quarter of a degree."""
+"""Circular variance below which axes count as parallel: within a quarter of a degree."""
 MAX_PAN_SPREAD_RATIO = 0.05
-"""Largest spread of the centres of a camera that turns on a spot, as a share of the depth of what it sees."""
+"""Largest spread of the centres of a pan, relative to the median depth."""
 MAX_FORWARD_SPREAD_RATIO = 1.5
-"""Largest spread of forward-facing cameras likewise; farther apart, they do not look at one thing."""
+"""Largest spread of forward-facing cameras, relative to the median depth; wider ones do not share a subject."""
 SINGLE_PRECISION_EPS, DOUBLE_PRECISION_EPS = 5e-7, 1e-12
-"""Centres that spread by less than this share of their coordinates are the same, by the precision they are given in."""
+"""Spreads below this share of the coordinates are rounding, by the precision of the poses."""
 DENSITY_CONCENTRATION, MAX_DENSITY_WEIGHT = 8.0, 3.0
-"""Concentration of the kernel that estimates how densely directions are seen from, and the largest weight of a lone view."""
+"""Concentration (von Mises-Fisher) of the density estimate of viewing directions, and the largest weight of a lone view."""
 MAX_POINTS = 4096
 
 
 class CameraLayout(StrEnum):
-    """What a capture's poses say about how it was taken."""
+    """How a scene was photographed, by its poses."""
 
     INWARD = "inward"
-    """Around a subject, or an arc of more than about 70 degrees: axes meet in front of the cameras."""
+    """Around a subject, by an arc of more than about 70 degrees: axes meet in front of the cameras."""
     FORWARD = "forward"
     """From one side: axes nearly parallel, converging or slightly diverging."""
     PAN = "pan"
-    """Turning on a spot, as on a tripod: centres differ by next to nothing. A single camera, too."""
+    """Rotating on the spot, as on a tripod: centres coincide. A single camera, too."""
     WALK = "walk"
-    """Anything else: rooms walked through, streets, fly-throughs."""
+    """Anything else: walks through rooms, streets, fly-throughs."""
 
 
 def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | None = None) -> CameraLayout:
-    """Classifies cameras by their poses (OpenCV, camera to world).
+    """Classifies camera poses (OpenCV, camera to world).
 
-    Poses alone do not tell the depth of the scene: a pan whose centre moves is a walk then.
+    Poses alone do not give the depth of the scene: without points, a pan whose centre moves is a walk.
 
     Args:
-        c2w: at least one pose; any similarity gives the same answer.
-        points: on surfaces, in the poses' frame; they tell the depth.
+        c2w: at least one pose; the result is invariant to similarities.
+        points: surface points in the poses' frame, for the depth.
     """
     c2w = c2w.double()
     centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
@@ -63,12 +63,12 @@ def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | 
 
 
 def circular_variance(directions: Float[Tensor, "V 3"]) -> float:
-    """1 - the length of the mean of unit vectors: 0 where all are the same, 1 where they cancel out."""
+    """Circular variance of unit vectors, 1 - |mean|: 0 if all are equal, 1 if they cancel out."""
     return 1 - float(directions.mean(0).norm())
 
 
 def centre_spread(c2w: Float[Tensor, "V 4 4"]) -> float:
-    """Median distance of the centres from their median; 0 where they differ by rounding alone."""
+    """Median distance of the camera centres from their median; 0 if they differ by rounding alone."""
     centres = c2w[:, :3, 3].double()
     distance = (centres - centres.median(0).values).norm(dim=1)
     spread = float(distance.median()) or float(distance.mean())
@@ -78,30 +78,29 @@ def centre_spread(c2w: Float[Tensor, "V 4 4"]) -> float:
 
 
 def median_depth(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> float | None:
-    """Median distance, over the cameras, to the points within 45 degrees of the axis; None where no camera has any."""
-    some = points[:: -(-len(points) // MAX_POINTS)].double() if len(points) else points.double()
+    """Median over cameras of the median distance to points within 45 degrees of the axis; None if no camera has any."""
+    subset = points[:: -(-len(points) // MAX_POINTS)].double() if len(points) else points.double()
     depths = []
     for pose in c2w.double():
-        local = (some - pose[:3, 3]) @ pose[:3, :3]
+        local = (subset - pose[:3, 3]) @ pose[:3, :3]
         distance = local.norm(dim=1)
-        ahead = local[:, 2] > 0.7 * distance
-        if ahead.any():
-            depths.append(distance[ahead].median())
+        in_view = local[:, 2] > 0.7 * distance
+        if in_view.any():
+            depths.append(distance[in_view].median())
     return float(torch.stack(depths).median()) if depths else None
 
 
 def is_dolly(centres: Float[Tensor, "V 3"], axes: Float[Tensor, "V 3"]) -> bool:
-    """Whether centres spread along the mean axis more than across it."""
+    """True if camera centres spread along the mean axis more than across it."""
     offset = centres - centres.mean(0)
     axial = offset @ normalize(axes.mean(0), dim=0)
     return bool(2 * axial.square().sum() > offset.square().sum())
 
 
 def find_convergence(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"] | None:
-    """The point that cameras look at together, double precision; None where they look at none.
+    """The point where camera axes converge, double precision; None if they do not.
 
-    It has to explain where they look better than one direction does: 1 - (mean of 1 - cos of the angles between axes and the
-    point) / (circular variance of the axes) is at least `MIN_CONVERGENCE`.
+    Score: 1 - mean(1 - cos(angle between axis and point)) / (circular variance of the axes), at least `MIN_CONVERGENCE`.
     """
     variance = circular_variance(normalize(c2w[:, :3, 2].double(), dim=1))
     if centre_spread(c2w) == 0 or variance < MAX_PARALLEL_VARIANCE:
@@ -111,31 +110,31 @@ def find_convergence(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"] | None:
 
 
 def axis_cosines(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> Float[Tensor, "P V"]:
-    """Cosine of the angle between each camera's axis and its direction to each point."""
-    toward = normalize(points[:, None] - c2w[:, :3, 3].double(), dim=2)
-    return (toward * normalize(c2w[:, :3, 2].double(), dim=1)).sum(2)
+    """Cosines of the angles between each camera's axis and its direction to each point."""
+    directions = normalize(points[:, None] - c2w[:, :3, 3].double(), dim=2)
+    return (directions * normalize(c2w[:, :3, 2].double(), dim=1)).sum(2)
 
 
 def find_focus_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
-    """The point in front of the cameras that is nearest to their axes by angle; far away where axes do not converge.
+    """The focus point: nearest to all camera axes by angle; far away if the axes do not converge.
 
-    Maximises the mean cosine between axes and directions to the point, each view weighted by how few others look from
-    its direction. For cameras all around that are framed to one side alike, that is the middle of their circle.
+    Maximizes the mean cosine between axes and directions to the point, with views weighted by the inverse density of
+    viewing directions. For a ring of cameras that all frame the subject to one side, that is the ring's centre.
     """
     c2w = c2w.double().clone()
     middle = c2w[:, :3, 3].mean(0)
     size = float((c2w[:, :3, 3] - middle).norm(dim=1).mean()) or 1.0
     c2w[:, :3, 3] = (c2w[:, :3, 3] - middle) / size
     centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
-    ahead = [centres + reach * axes for reach in (0.5, 1.0, 2.0, 4.0)]
-    start = torch.cat([torch.zeros_like(centres[:1]), *ahead])
+    candidates = [centres + reach * axes for reach in (0.5, 1.0, 2.0, 4.0)]
+    start = torch.cat([torch.zeros_like(centres[:1]), *candidates])
     start = start[:: -(-len(start) // 512)]
     weights = torch.full_like(centres[:, 0], 1 / len(centres))
     point = start[(axis_cosines(c2w, start) @ weights).argmax()]
     for _ in range(3):
         point = _maximize_mean_cosine(c2w, point, weights)
-        toward = normalize(point - centres, dim=1)
-        density = torch.exp(DENSITY_CONCENTRATION * (toward @ toward.T - 1)).sum(1)
+        directions = normalize(point - centres, dim=1)
+        density = torch.exp(DENSITY_CONCENTRATION * (directions @ directions.T - 1)).sum(1)
         weights = (1 / density).clamp_max(MAX_DENSITY_WEIGHT / float(density.median()))
         weights = weights / weights.sum()
     return middle + size * point
@@ -144,7 +143,7 @@ def find_focus_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
 def _maximize_mean_cosine(
     c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"], weights: Float[Tensor, "V"]
 ) -> Float[Tensor, "3"]:
-    """The nearest maximum of the weighted mean cosine, by Levenberg-Marquardt on the chords between directions and axes."""
+    """Local maximum of the weighted mean cosine, by Levenberg-Marquardt on the chords between directions and axes."""
     centres, axes = c2w[:, :3, 3].cpu().numpy(), normalize(c2w[:, :3, 2], dim=1).cpu().numpy()
     root = weights.sqrt()[:, None].cpu().numpy()
 

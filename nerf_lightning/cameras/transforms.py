@@ -1,4 +1,4 @@
-"""Pinhole geometry in pure functions. OpenCV frame: x right, y down, z forward; pixel centres at +0.5."""
+"""Pinhole geometry and rigid transforms. OpenCV frame: x right, y down, z forward; pixel centres at +0.5."""
 
 import torch
 from jaxtyping import Float
@@ -20,10 +20,10 @@ def transform_directions(
 
 
 def transform_poses(c2w: Float[Tensor, "V 4 4"], similarity: Float[Tensor, "4 4"]) -> Float[Tensor, "V 4 4"]:
-    """Poses in the frame that a similarity (a turn, a scale and a shift) leads to, in double precision; they stay rigid."""
-    moved = similarity.double() @ c2w.double()
-    moved[:, :3, :3] /= torch.linalg.det(similarity[:3, :3].double()) ** (1 / 3)
-    return moved
+    """Transforms camera poses by a similarity (rotation, scale, translation), in double precision; they stay rigid."""
+    transformed = similarity.double() @ c2w.double()
+    transformed[:, :3, :3] /= torch.linalg.det(similarity[:3, :3].double()) ** (1 / 3)
+    return transformed
 
 
 def pixel_to_camera(
@@ -41,7 +41,7 @@ def pixel_to_camera(
 
 
 def pixels_to_normalized(K: Float[Tensor, "*#batch 3 3"], uv: Float[Tensor, "*#batch 2"]) -> Float[Tensor, "*batch 2"]:
-    """Flat coordinates (x/z, y/z of a pinhole camera) of places in pixels: K^-1 [u, v, 1] by back-substitution."""
+    """Normalized coordinates (x/z, y/z of a pinhole camera) of pixels: K^-1 [u, v, 1] by back-substitution."""
     y = (uv[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
     x = (uv[..., 0] - K[..., 0, 2] - K[..., 0, 1] * y) / K[..., 0, 0]
     return torch.stack([x, y], dim=-1)

@@ -1,1 +1,1 @@
-"""Photos -> scene: tags, lens, cameras, undistortion, packing."""
+"""Photos with printed tags -> scene: detection, calibration, poses, undistortion."""

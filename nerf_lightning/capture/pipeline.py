@@ -1,4 +1,4 @@
-"""From two folders of photos to a scene file and the files beside it."""
+"""The capture pipeline: two folders of photos -> scene file, cameras.json and calibration.yaml."""
 
 import logging
 from collections.abc import Sequence
@@ -26,12 +26,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Capture:
-    """All results, for the report."""
+    """All results of a capture, for the report."""
 
     calibration: Calibration
     solution: PoseSolution
     photos: list[RegisteredPhoto]
-    """Of the subject, in the order taken."""
+    """Photos of the subject, in the order taken."""
     scene: Scene
 
 
@@ -47,15 +47,15 @@ def capture_scene(
     max_side: int | None = 300,
     holdout: int = 10,
 ) -> Capture:
-    """Calibrates, places the photos, and writes the scene, `cameras.json` and `calibration.yaml`; see `command.capture`.
+    """Calibrates, solves the poses, and writes the scene, `cameras.json` and `calibration.yaml`; see `command.capture`.
 
     Args:
         calibration, photos, tag_size, output, dictionary, layout, holdout: see there.
-        board: a ChArUco board instead of tags on their own.
+        board: a ChArUco board instead of single tags.
         max_side: side of the scene's photos in pixels; None keeps their size.
 
     Raises:
-        InputError: the options or photos are no good.
+        InputError: invalid options or unusable photos.
     """
     sheet_paths, paths = find_photos(calibration, "calibration"), find_photos(photos, "photos")
     dictionary_name = guess_dictionary(sheet_paths) if dictionary == "auto" else dictionary
@@ -63,20 +63,20 @@ def capture_scene(
     detector = (
         make_board_detector(dictionary_name, tag_size, board) if board else make_tag_detector(dictionary_name, tag_size)
     )
-    log.info("looking for tags of %s in %s and %s", dictionary_name, calibration, photos)
+    log.info("detecting tags of %s in %s and %s", dictionary_name, calibration, photos)
     sheet, observations = detect_tags(sheet_paths, detector), detect_tags(paths, detector)
 
     lens_calibration = calibrate(calibration, sheet, known)
     for text in lens_calibration.warnings:
         log.warning("calibration: %s", text)
     for name, reason in lens_calibration.excluded.items():
-        log.warning("%s left out of the calibration: %s", name, reason)
+        log.warning("%s excluded from the calibration: %s", name, reason)
     log.info("focal length %.1f pixels, reprojection error %.2f pixels", lens_calibration.lens.fx, lens_calibration.rms)
 
     solution, registered = register_photos(photos, observations, lens_calibration.lens, known)
     for photo in registered:
         if photo.c2w is None:
-            log.warning("%s left out: %s", photo.name, photo.reason)
+            log.warning("%s excluded: %s", photo.name, photo.reason)
     c2w = {photos / photo.name: photo.c2w for photo in registered if photo.c2w is not None}
     scene = build_scene(
         list(c2w), np.stack(list(c2w.values())), lens_calibration.lens, output.stem, str(photos), max_side, holdout

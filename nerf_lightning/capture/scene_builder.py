@@ -1,4 +1,4 @@
-"""Placed photos become a scene: undistorted, resized, split, with bounds and an orbit."""
+"""Builds a scene from registered photos: undistorted, resized, split, with bounds and an orbit."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,16 +21,15 @@ from nerf_lightning.dataset.views import Views
 from nerf_lightning.errors import InputError
 
 SUBJECT_WIDTH_FRACTION = 0.5
-"""The box's share of the width that photos show at the subject. The tags around an object may lie outside the box, where a
-field has less detail the farther out."""
+"""Width of the box relative to the width that photos show at the subject; tags may lie outside, in the contracted part."""
 
 
 def undistort_photos(
     paths: Sequence[Path], lens: Intrinsics, width: int, height: int
 ) -> tuple[UInt8[np.ndarray, "V h w 3"], Float[np.ndarray, "3 3"]]:
-    """Photos, upright, their distortion undone, averaged down to a size; and K of the pinhole camera before that.
+    """Undistorts photos and downsamples them to a size; also returns K of the full-size pinhole camera.
 
-    It zooms in just so far that no border without a source pixel is left.
+    The pinhole camera zooms in just enough that every pixel has a source.
     """
     size, distortion = (lens.width, lens.height), lens.opencv_distortion
     half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV puts pixel centres at integers, we put them at +0.5
@@ -41,7 +40,7 @@ def undistort_photos(
     photos = []
     for path in paths:
         image = np.ascontiguousarray(read_pixels(path, upright=True)[..., :3])
-        # Replicating keeps rounding at the very edge from painting it black.
+        # Replicated borders keep rounding from turning edge pixels black.
         image = cv2.remap(image, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         photos.append(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA))
     return np.stack(photos), pinhole + half
@@ -56,16 +55,15 @@ def build_scene(
     max_side: int | None = 300,
     holdout: int = 10,
 ) -> Scene:
-    """Makes a scene of placed photos.
+    """Builds an unbounded scene from registered photos.
 
-    Undistortion zooms in until every pixel has a source, so that there is no black border. The scene's frame is that of the
-    tags: metres, z out of the paper. The box is a cube around what the cameras look at, half as wide as the photos show there;
-    the scene is unbounded.
+    The scene's frame is that of the tags: metres, z out of the paper. The box is a cube around the point that the cameras
+    look at, half as wide as the photos show there.
 
     Args:
         paths: the photos, all of the lens's size.
         c2w: camera to world, OpenCV frame, metres.
-        lens: of the photos.
+        lens: intrinsics of the photos.
         name, source: see `Scene`.
         max_side: side of the scene's photos in pixels; None keeps their size.
         holdout: every N-th photo is held out.
@@ -74,7 +72,7 @@ def build_scene(
         InputError: fewer than two photos.
     """
     if len(paths) < 2:
-        raise InputError(source, "", f"{len(paths)} placed photos", "at least 2: one to train on, one to hold out")
+        raise InputError(source, "", f"{len(paths)} registered photos", "at least 2: one to train on, one to hold out")
     width, height = fit_size(lens.width, lens.height, max_side)
     photos, pinhole = undistort_photos(paths, lens, width, height)
     images, K = torch.from_numpy(photos), torch.from_numpy(pinhole).float().repeat(len(paths), 1, 1)

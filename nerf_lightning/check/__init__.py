@@ -1,1 +1,1 @@
-"""A page about a scene's photos before training: sharpness, exposure, cameras, and what the checks doubt."""
+"""HTML report on a scene before training: sharpness, exposure, duplicates, cameras and consistency checks."""

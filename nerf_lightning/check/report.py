@@ -1,4 +1,4 @@
-"""What is known of a scene and what is doubted: facts, warnings, checks before training, troubles of photos; and the page."""
+"""The check report: facts of a scene, warnings, consistency checks, issues of photos, and the HTML page."""
 
 import logging
 from collections import Counter
@@ -26,7 +26,7 @@ MAX_WARNINGS = 10_000
 
 @contextmanager
 def record_warnings() -> Iterator[list[logging.LogRecord]]:
-    """Yields what the package warns of within a block, such as photos that were left out."""
+    """Records the package's warnings within a block, such as excluded photos."""
     handler, log = BufferingHandler(MAX_WARNINGS), logging.getLogger("nerf_lightning")
     handler.setLevel(logging.WARNING)
     log.addHandler(handler)
@@ -37,15 +37,15 @@ def record_warnings() -> Iterator[list[logging.LogRecord]]:
 
 
 def check_before_training(scene: Scene) -> list[str]:
-    """What the checks before training say, refusals too."""
+    """Runs the checks before training and returns their messages, errors included."""
     try:
-        return [doubt.text for doubt in check_scene(scene)]
+        return [finding.text for finding in check_scene(scene)]
     except InputError as error:
         return [str(error)]
 
 
 def assess_photos(scene: Scene) -> tuple[list[PhotoQuality], list[tuple[int, Float[np.ndarray, "4 4"]]]]:
-    """All photos in the order of their names with their troubles, and the number and pose of each."""
+    """Measures all photos and finds their issues, in the order of their names; also the number and pose of each."""
     photos = [*measure_photos(scene.train, "train"), *measure_photos(scene.val, "held out")]
     poses = [*scene.train.cameras.c2w.double().numpy(), *scene.val.cameras.c2w.double().numpy()]
     posed = sorted(zip(photos, poses, strict=True), key=lambda pair: pair[0].name)
@@ -57,7 +57,7 @@ def assess_photos(scene: Scene) -> tuple[list[PhotoQuality], list[tuple[int, Flo
 
 
 def describe_scene(scene: Scene) -> dict[str, str]:
-    """What the scene is."""
+    """Facts of a scene, by name."""
     sizes = Counter(map(tuple, scene.train.cameras.sizes.tolist() + scene.val.cameras.sizes.tolist()))
     cameras, bounds = scene.train.cameras, scene.bounds
     lens = "pinhole" if cameras.lenses is None else "distorted; rays follow the lens"
@@ -86,7 +86,7 @@ def render_check_page(
     photos: Sequence[PhotoQuality],
     poses: list[tuple[int, Float[np.ndarray, "4 4"]]],
 ) -> str:
-    """The page's HTML, with what is wrong in words, and the photos with the most troubles first."""
+    """Renders the page's HTML, with the remarks first and photos by their number of issues."""
     worst_first = sorted(photos, key=lambda photo: (-len(photo.issues), photo.number))
     return render_page(
         FOLDER / "check.html",

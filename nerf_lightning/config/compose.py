@@ -1,4 +1,4 @@
-"""Composes configurations as the command line does, for code that runs without one: the front door, tests, benchmarks."""
+"""Composes configurations without a command line, for the Python API, tests and benchmarks."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from nerf_lightning.config.quoting import escape_interpolations
 
 
 def compose_config(overrides: list[str], folder: Path) -> DictConfig:
-    """The configuration that a command line would train with, with `folder` as the run's."""
+    """Composes the configuration that a command line would train with, for the run folder `folder`."""
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
         cfg = compose("config", replace_nulls(overrides), return_hydra_config=True)
     with open_dict(cfg):
         cfg.hydra.runtime.output_dir = escape_interpolations(str(folder))
     HydraConfig.instance().set_config(cfg)
-    own = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
-    check_run_options(own, cfg.hydra.runtime.choices)
-    return own
+    run_cfg = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
+    check_run_options(run_cfg, cfg.hydra.runtime.choices)
+    return run_cfg

@@ -1,4 +1,4 @@
-"""How much a device processes at once: a default for each kind of device, in conf/devices, which a run may override."""
+"""Device limits: how much is processed at once, by default for each kind of device in conf/devices."""
 
 from dataclasses import dataclass
 
@@ -21,14 +21,14 @@ class Limits:
 
 
 def get_limits(cfg: DictConfig, device: torch.device) -> Limits:
-    """A run's own limits, or else the defaults of its device.
+    """Limits of a run, or else the defaults of its device.
 
     Raises:
         InputError: for an unknown limit, or one below 1.
     """
     folder = conf_dir() / "devices"
-    own = folder / f"{device.type}.yaml"
-    limits = yaml.safe_load((own if own.exists() else folder / "cpu.yaml").read_text(encoding="utf-8"))
+    file = folder / f"{device.type}.yaml"
+    limits = yaml.safe_load((file if file.exists() else folder / "cpu.yaml").read_text(encoding="utf-8"))
     limits |= {str(key): value for key, value in cfg.get("limits", {}).items() if value is not None}
     check_options("limits", Limits, limits)
     return Limits(**limits)

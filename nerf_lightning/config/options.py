@@ -1,4 +1,4 @@
-"""Options of a run at the top level of its configuration, and groups that null leaves out."""
+"""Run options: top-level keys of a configuration, and groups that null omits."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -13,9 +13,9 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.option_checks import Count, Le, Seed, check_options
 
 OPTIONAL_GROUPS = ("callbacks", "logger", "recipe", "refine", "renderer", "sampler")
-"""Groups that a run can do without: a 2D field has no sampler and no renderer."""
+"""Groups that a run may omit: a 2D field has no sampler and no renderer."""
 NONE_OPTION = "none"
-"""Name of the option of such a group that sets nothing, as Hydra takes no null for a group."""
+"""Option of an optional group that sets nothing, as Hydra takes no null for a group."""
 
 for _group in OPTIONAL_GROUPS:
     ConfigStore.instance().store(name=NONE_OPTION, node={}, group=_group, package="_global_", provider="nerf_lightning")
@@ -23,7 +23,7 @@ for _group in OPTIONAL_GROUPS:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Keys at the top level of a run's configuration, see conf/config.yaml; groups are checked when they are built."""
+    """Top-level keys of a run's configuration, see conf/config.yaml; groups are checked when they are built."""
 
     name: str
     method: str
@@ -48,14 +48,14 @@ class RunOptions:
     callbacks: dict | None = None
     logger: dict | None = None
     render: dict | None = None
-    """Of an experiment with a 2D field: `scale` of the enlarged image."""
+    """Of 2D experiments: `scale` of the enlarged image."""
 
 
 def replace_nulls(arguments: Sequence[str]) -> list[str]:
     """Rewrites GROUP=null to GROUP=none on a command line, also among the values of a sweep.
 
     Raises:
-        InputError: for a group that no run can do without.
+        InputError: for a group that no run can omit.
     """
     replaced, groups = [], {folder.name for folder in conf_dir().iterdir() if folder.is_dir()}
     for argument in arguments:
@@ -65,20 +65,20 @@ def replace_nulls(arguments: Sequence[str]) -> list[str]:
             if group not in OPTIONAL_GROUPS:
                 options = ", ".join(sorted(file.stem for file in (conf_dir() / group).glob("*.yaml")))
                 raise InputError("command line", group, "null", f"one of {options}")
-            argument = f"{key}={','.join(NONE_OPTION if one == 'null' else one for one in values)}"
+            argument = f"{key}={','.join(NONE_OPTION if name == 'null' else name for name in values)}"
         replaced.append(argument)
     return replaced
 
 
 def check_run_options(cfg: DictConfig, choices: Mapping[str, str | None]) -> None:
-    """Sets groups that were left out to null, and checks the keys at the top level.
+    """Sets omitted groups to null, and checks the top-level keys.
 
     Args:
         cfg: composed, without Hydra's node.
         choices: option of each group, as Hydra keeps it.
 
     Raises:
-        InputError: for a key that nothing reads, a missing one, and a value of the wrong type.
+        InputError: for an unknown key, a missing one, and a value of the wrong type.
     """
     with open_dict(cfg):
         for group in OPTIONAL_GROUPS:

@@ -1,6 +1,6 @@
-"""Paths and other text that Hydra or OmegaConf would read as something else: quoted on command lines, escaped in configs.
+"""Quotes text on command lines, and escapes it in configs, where Hydra or OmegaConf would misread it, such as paths.
 
-Hydra's grammar takes parentheses, commas, `=`, `#` and non-ASCII letters apart; OmegaConf takes `${` for an interpolation.
+Hydra's grammar parses parentheses, commas, `=`, `#` and non-ASCII letters; OmegaConf takes `${` for an interpolation.
 """
 
 import os
@@ -13,32 +13,32 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString, Valu
 from hydra.errors import HydraException
 
 TEXT_KEYS = ("resume", "name", "method", "dataset.path", "dataset.name", "dataset.folder", "dataset.url")
-"""Keys whose values are text, whatever its letters."""
+"""Keys whose values are literal text."""
 FOLDER_KEYS = ("hydra.run.dir", "hydra.sweep.dir")
-"""Keys of folders that Hydra makes: text, too, and always one value."""
+"""Keys of folders that Hydra makes: literal text, and never several values."""
 
 
 def escape_interpolations(value: Any) -> Any:
-    """Plain values as OmegaConf must be given them so that it interpolates nothing in their text."""
+    """Escapes plain values, so that OmegaConf interpolates nothing in their text."""
     if isinstance(value, dict):
-        return {key: escape_interpolations(one) for key, one in value.items()}
+        return {key: escape_interpolations(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [escape_interpolations(one) for one in value]
+        return [escape_interpolations(item) for item in value]
     if not isinstance(value, str):
         return value
-    return re.sub(r"(\\*)\$\{", lambda found: f"{found[1] * 2}\\${{", value)  # backslashes before it escape, too
+    return re.sub(r"(\\*)\$\{", lambda match: f"{match[1] * 2}\\${{", value)  # backslashes before it escape, too
 
 
 def make_override(key: str, text: str | os.PathLike[str]) -> str:
-    """The command-line argument that sets a key to text, whatever its letters are."""
+    """Command-line argument that sets a key to literal text."""
     return f"{key}={_quote(key, escape_interpolations(os.fspath(text)))}"
 
 
 def quote_overrides(arguments: Sequence[str], sweep: bool) -> list[str]:
-    """Quotes values that Hydra would not read as the text they are: those of text keys, and all that it cannot parse.
+    """Quotes values that Hydra would misread: those of text keys, and all that it cannot parse.
 
-    The name of an existing file or folder is literal. Other text may hold interpolations, be quoted by the user, or be a list
-    in brackets; in a sweep it may be several values, separated by commas.
+    Names of existing files and folders are literal. Other text may hold interpolations, be quoted by the user, or be a list in
+    brackets; in a sweep it may be several values, separated by commas.
     """
     return [_quote_value(argument, sweep) for argument in arguments]
 
@@ -55,12 +55,12 @@ def _quote_value(argument: str, sweep: bool) -> str:
     is_function = parsed and parsed.is_sweep_override() and parsed.value_type is not ValueType.SIMPLE_CHOICE_SWEEP
     if parsed and (value[0] in "'\"[" or (sweep and is_function)):
         return argument
-    values = [one.strip() for one in value.split(",")] if sweep and name in TEXT_KEYS else [value]
-    return f"{key}={','.join(_quote(key, one) for one in values)}"
+    values = [part.strip() for part in value.split(",")] if sweep and name in TEXT_KEYS else [value]
+    return f"{key}={','.join(_quote(key, part) for part in values)}"
 
 
 def _quote(key: str, text: str) -> str:
-    """Text in quotes, where Hydra would not read it as it is."""
+    """Quotes text that Hydra would misread."""
     parsed = _parse(f"{key}={text}")
     if parsed is not None and not parsed.is_sweep_override() and parsed.value() == text:
         return text
@@ -68,7 +68,7 @@ def _quote(key: str, text: str) -> str:
 
 
 def _parse(argument: str) -> Override | None:
-    """An argument as Hydra reads it; None where it cannot."""
+    """Parses an argument as Hydra does; None where it cannot."""
     try:
         return OverridesParser.create().parse_override(argument)
     except HydraException:

@@ -1,4 +1,4 @@
-"""Resolvers for conf/: folders named after the command line, and the recipe's name. Imports nothing heavy."""
+"""OmegaConf resolvers for conf/: folders named after the command line, and the recipe's name. Imports nothing heavy."""
 
 import hashlib
 import sys
@@ -10,11 +10,11 @@ from omegaconf import OmegaConf
 from nerf_lightning.config import conf_dir
 
 MAX_SLUG_CHARS = 120
-"""Most letters in a folder's name."""
+"""Longest name of a folder, in characters."""
 
 
 def slugify(text: str) -> str:
-    """Text as the name of a folder. Long text is cut and ends in a hash of the whole, so that names stay different."""
+    """Converts text to a folder's name. Long text is cut and ends in a hash of the whole."""
     plain = "".join(c if c.isalnum() or c in "=.,_-+" else "-" for c in text) or "all"
     if len(plain) <= MAX_SLUG_CHARS:
         return plain
@@ -22,10 +22,10 @@ def slugify(text: str) -> str:
 
 
 def sweep_folder(arguments: Sequence[str]) -> str:
-    """Where a sweep's jobs go: the same command line finds the same folder again.
+    """Folder of a sweep: the same command line gives the same folder.
 
-    It is named after the run's name (or else the experiment) and all other options given; flags, Hydra's own settings and
-    `overwrite` do not count.
+    Named after the run's name (or else the experiment) and all other options given; flags, Hydra's settings and `overwrite` do
+    not count.
     """
     words = [word.lstrip("+") for word in arguments if not word.startswith("-")]
     given = dict(word.partition("=")[::2] for word in words if not word.startswith(("hydra.", "hydra/")))
@@ -36,20 +36,20 @@ def sweep_folder(arguments: Sequence[str]) -> str:
 
 
 def fixed_keys(arguments: Sequence[str]) -> list[str]:
-    """Options that a command line sets to one value, rather than to several."""
+    """Keys that a command line sets to one value, rather than to several."""
     written = [argument for argument in arguments if "=" in argument and not argument.startswith("-")]
     parsed = OverridesParser.create().parse_overrides(written)
     return sorted(override.key_or_group for override in parsed if not override.is_sweep_override())
 
 
 def job_name(overrides: Sequence[str], fixed: Sequence[str]) -> str:
-    """The name of a job: its overrides, without those that are the same for all jobs."""
-    return slugify(",".join(sorted(one for one in overrides if one.lstrip("+~").partition("=")[0] not in fixed)))
+    """Name of a job: its overrides, without those shared by all jobs."""
+    return slugify(",".join(sorted(text for text in overrides if text.lstrip("+~").partition("=")[0] not in fixed)))
 
 
 def recipe_name(recipe: str | None, model: str) -> str | None:
-    """The recipe, if the model chosen is the recipe's, after which it is named; None for another one, as in
-    `+experiment=lego model=mlp`. A user's own, in another folder, may have any name."""
+    """The recipe's name, if it starts with that of the chosen model; None otherwise, as in `+experiment=lego model=mlp`. A
+    user's recipe, in another folder, may have any name."""
     shipped = (conf_dir() / "recipe" / f"{recipe}.yaml").is_file()
     return None if shipped and not str(recipe).startswith(f"{model}_") else recipe
 

@@ -1,4 +1,4 @@
-"""Stage 2, dataset: photos and poses become a Scene, whatever format they come in."""
+"""Stage 2, dataset: loads photos and poses of any format into a Scene."""
 
 from nerf_lightning.dataset.formats.npz import load_npz, save_npz
 from nerf_lightning.dataset.formats.transforms import load_blender, load_transforms
@@ -12,7 +12,7 @@ from nerf_lightning.dataset.scene_reader import open_scene
 from nerf_lightning.dataset.views import Views
 
 DataModule = RayDataModule | PixelDataModule
-"""Of a scene, or of a picture."""
+"""For a scene (3D) or a picture (2D)."""
 
 __all__ = [
     "BUILT_IN",

@@ -1,5 +1,4 @@
-"""How data modules feed a system: a batch for each step, drawn from the seed, the step and what data were told of
-earlier steps, which checkpoints keep, and held-out views whole."""
+"""Deterministic, step-indexed data loading: a batch depends only on seed, step and error map; validation is by view."""
 
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, ClassVar, Generic, TypeVar
@@ -20,12 +19,12 @@ ENDLESS_LENGTH = 2**31 - 1
 
 
 class BatchLoader(Generic[Batch]):
-    """Makes a batch for each index.
+    """Yields a batch for each index.
 
     Args:
         make: index -> batch.
-        indices: steps, each asked for when its batch is wanted, so that a resumed run goes on where it stopped; or views.
-        length: how many; endless for steps. Without one, Lightning reads a batch ahead, which would break exact resuming.
+        indices: steps, read lazily, so that a resumed run continues exactly; or views.
+        length: number of batches; endless for steps. Without it Lightning prefetches a batch: resuming is not exact.
     """
 
     def __init__(self, make: Callable[[int], Batch], indices: Iterable[int], length: int = ENDLESS_LENGTH):
@@ -38,23 +37,23 @@ class BatchLoader(Generic[Batch]):
         return map(self.make, self.indices)
 
     def state_dict(self) -> dict[str, int]:
-        """Nothing to keep but the trainer's step. Having the method tells Lightning that resuming is exact."""
+        """Empty: the trainer keeps the step. Defining the method tells Lightning that resuming is exact."""
         return {}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
-        """Nothing to restore, see `state_dict`."""
+        """Does nothing, see `state_dict`."""
 
 
 class StepDataModule(L.LightningDataModule, Generic[Photos]):
-    """Base of the two data modules.
+    """Base class of the two data modules.
 
     Args:
-        photos: what batches are drawn from.
-        seed: of the draw.
+        photos: pixels that batches are sampled from.
+        seed: random seed of the sampling.
     """
 
     is_posed: ClassVar[bool]
-    """Whether it draws from the posed photos of a scene, not from a picture."""
+    """True for posed photos of a scene, False for a picture."""
     scene: Any
     """The `Scene` or `Picture`."""
     num_held_out_views: int
@@ -64,12 +63,12 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
         self.photos: Photos = photos
         self.seed = seed
         self.test_subset = ALL_PIXELS
-        """What `test_dataloader` gives of each held-out view."""
+        """Pixels of each held-out view that `test_dataloader` yields."""
         self._device_photos: Photos | None = None
-        """The photos, on the device where batches are drawn."""
+        """Copy on the device where batches are sampled."""
 
     def draw(self, step: int) -> Any:
-        """The batch of a step; of several processes that share a run, each gets every so many entries of it."""
+        """Samples the batch of a step; in a distributed run each rank takes every `world_size`-th entry."""
         trainer = self.trainer
         if self._device_photos is None:
             device = CPU if trainer is None else trainer.strategy.root_device
@@ -78,22 +77,22 @@ class StepDataModule(L.LightningDataModule, Generic[Photos]):
         return self.draw_batch(self._device_photos, step, part)
 
     def draw_batch(self, photos: Photos, step: int, part: slice) -> Any:
-        """A part of the batch of a step."""
-        raise TypeError(f"{type(self).__name__} must define draw_from(photos, step, part)")
+        """Samples a part of the batch of a step."""
+        raise TypeError(f"{type(self).__name__} must define draw_batch(photos, step, part)")
 
     def reset(self) -> None:
-        """Before another training on the same photos."""
+        """Resets the state before another training on the same photos."""
 
     def find_issues(self, refines_poses: bool) -> list[SceneIssue]:
-        """What to warn of before training, see `check_scene`."""
+        """Problems to warn about before training, see `check_scene`."""
         return []
 
     def get_held_out_view(self, view: int, subset: PixelSubset = ALL_PIXELS) -> Any:
-        """One held-out view."""
-        raise TypeError(f"{type(self).__name__} must define held_out(view, subset)")
+        """Loads one held-out view."""
+        raise TypeError(f"{type(self).__name__} must define get_held_out_view(view, subset)")
 
     def set_test_subset(self, subset: PixelSubset) -> None:
-        """The next test loads only these pixels of each held-out view."""
+        """Restricts the next test to these pixels of each held-out view."""
         self.test_subset = subset
 
     def train_dataloader(self) -> BatchLoader:

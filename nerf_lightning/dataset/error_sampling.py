@@ -1,4 +1,4 @@
-"""Draws more of the pixels where a field is not right yet, and says by how much less each of these counts."""
+"""Error-guided pixel sampling with importance weights."""
 
 from collections.abc import Mapping
 
@@ -9,29 +9,28 @@ from torch import Tensor
 from nerf_lightning.dataset.views import Views
 
 TILE_SIZE = 16
-"""Pixels along a side of a tile, which has one error: smaller ones are met too seldom to know it."""
+"""Tile side in pixels. Each tile has one running error; smaller tiles are sampled too rarely to estimate it."""
 ERROR_WINDOW = 8
-"""About how many of its last pixels a tile's error is the mean of."""
+"""Samples in a tile's running mean error, approximately."""
 UPDATE_EVERY = 16
-"""Steps between looks at all tiles."""
+"""Steps between updates of the sampling probabilities."""
 ERROR_SCALE = 2.0**30
-"""Errors are summed as whole numbers, of this to one: sums do not depend on their order then, on any device."""
+"""Fixed-point scale of summed errors: integer sums do not depend on their order, on any device."""
 TOTAL_TICKETS = 1 << 40
-"""About how many lots all tiles have together, likewise whole."""
+"""Total integer tickets of all tiles, approximately (integers keep sampling deterministic)."""
 STATE_KEYS = ("sums", "counts", "new_sums", "new_counts")
-"""What a checkpoint keeps of each tile."""
+"""Tensors over all tiles in the checkpoint."""
 
 
 class ErrorSampler:
-    """Pixels drawn by the error of their surroundings: importance sampling, unbiased by weights.
+    """Importance sampling of pixels by the error around them, unbiased by weights.
 
-    A pixel's chance is the sum of two: the same for all, and for a `fraction` of the draws in proportion to the mean error
-    of the tile of its photo that it is in. A mean over pixels, each times its weight, is that over all known pixels: learning
-    aims at the same, by gradients of less noise.
+    Sampling probability = (1 - fraction) * uniform + fraction * (running mean error of the pixel's 16x16 tile). With the
+    importance weights the loss estimates the uniform mean over all valid pixels, with gradients of lower variance.
 
     Args:
-        views: the photos; at least one pixel is known.
-        fraction: of the draws that go by the error, in [0, 1).
+        views: photos with at least one valid pixel.
+        fraction: fraction of the samples drawn by error, in [0, 1).
     """
 
     def __init__(self, views: Views, fraction: float):
@@ -42,28 +41,28 @@ class ErrorSampler:
         self.tile_offsets = torch.cat(
             [sizes.new_zeros(1), (self.tiles_per_row * ((sizes[:, 1] + TILE_SIZE - 1) // TILE_SIZE)).cumsum(0)]
         )
-        """Where each photo's tiles begin, and where the last's end."""
+        """Index of each photo's first tile, and the number of tiles."""
         tiles = int(self.tile_offsets[-1])
         _, _, widths, heights, _ = self._locate_tiles(torch.arange(tiles).to(device))
         self.valid_counts = widths * heights if views.valid_mask is None else self._count_valid()
         self.sums, self.counts = torch.zeros(tiles, device=device), torch.zeros(tiles, device=device)
-        """Errors of the pixels that each tile remembers, and how many these are."""
+        """Sum of the errors in each tile's running mean, and their number."""
         self.new_sums, self.new_counts = torch.zeros_like(self.valid_counts), torch.zeros_like(self.valid_counts)
-        """Since the last look at all tiles; errors as whole numbers."""
+        """Since the last update; errors in fixed point."""
         self.num_updates = 0
         self.last_tiles = self.valid_counts[:0]
-        """Tiles of the last draw."""
+        """Tiles of the last samples."""
         self._update_probabilities()
 
     def _locate_tiles(self, tiles: Int[Tensor, "T"]) -> tuple[Int[Tensor, "T"], ...]:
-        """Of tiles: left, top, width, height in pixels, and photo."""
+        """Left, top, width and height of tiles in pixels, and their photos."""
         view = torch.searchsorted(self.tile_offsets, tiles, right=True) - 1
         number, sizes = tiles - self.tile_offsets[view], self.views.cameras.sizes.to(tiles.device)[view]
         left, top = number % self.tiles_per_row[view] * TILE_SIZE, number // self.tiles_per_row[view] * TILE_SIZE
         return left, top, (sizes[:, 0] - left).clamp_max(TILE_SIZE), (sizes[:, 1] - top).clamp_max(TILE_SIZE), view
 
     def _count_valid(self) -> Int[Tensor, "T"]:
-        """Known pixels in each tile."""
+        """Counts the valid pixels in each tile."""
         counts = []
         for view in range(len(self.views)):
             mask = self.views.view_mask(view).long()
@@ -73,25 +72,24 @@ class ErrorSampler:
         return torch.cat(counts)
 
     def _update_probabilities(self) -> None:
-        seen = self.counts > 0
         mean = self.sums.sum() / self.counts.sum().clamp_min(1)
-        error = torch.where(seen, self.sums / self.counts.clamp_min(1), mean)
-        known = self.valid_counts.float()
-        alike, wrong = known / known.sum(), known * error
-        by_error = torch.where(wrong.sum() > 0, wrong / wrong.sum().clamp_min(1e-30), alike)
-        chance = (1 - self.fraction) * alike + self.fraction * by_error
-        self.tickets = (chance * TOTAL_TICKETS).long().clamp_min(1) * (self.valid_counts > 0)
+        error = torch.where(self.counts > 0, self.sums / self.counts.clamp_min(1), mean)
+        valid = self.valid_counts.float()
+        uniform, total_error = valid / valid.sum(), valid * error
+        by_error = torch.where(total_error.sum() > 0, total_error / total_error.sum().clamp_min(1e-30), uniform)
+        probability = (1 - self.fraction) * uniform + self.fraction * by_error
+        self.tickets = (probability * TOTAL_TICKETS).long().clamp_min(1) * (self.valid_counts > 0)
         self.ticket_ends = self.tickets.cumsum(0)
         self.num_tickets, self.num_valid = int(self.ticket_ends[-1]), int(self.valid_counts.sum())
 
     def draw(self, count: int, generator: torch.Generator) -> tuple[Int[Tensor, "R"], Float[Tensor, "R"]]:
-        """Places in `Views.pixels`, and the weight of each: 0 for masked pixels in tiles that have known ones."""
+        """Samples indices into `Views.pixels`, and their weights: 0 for masked pixels in tiles with valid ones."""
         device = self.ticket_ends.device
-        lot = torch.randint(self.num_tickets, (count,), generator=generator, device=device)
-        self.last_tiles = tile = torch.searchsorted(self.ticket_ends, lot, right=True)
+        ticket = torch.randint(self.num_tickets, (count,), generator=generator, device=device)
+        self.last_tiles = tile = torch.searchsorted(self.ticket_ends, ticket, right=True)
         left, top, width, height, view = self._locate_tiles(tile)
-        across, down = torch.rand(2, count, generator=generator, device=device)
-        column, row = left + (across * width).long(), top + (down * height).long()
+        u, v = torch.rand(2, count, generator=generator, device=device)
+        column, row = left + (u * width).long(), top + (v * height).long()
         pixels = self.views.offsets[view] + row * self.views.widths[view] + column
         weights = (self.num_tickets / self.num_valid) * (width * height / self.tickets[tile])
         if self.views.valid_mask is not None:
@@ -99,28 +97,28 @@ class ErrorSampler:
         return pixels, weights
 
     def update(self, errors: Float[Tensor, "R"], mask: Bool[Tensor, "R"] | None = None) -> None:
-        """Called after each step with the error of each pixel of the last draw, 0 to 1, and which of them were measured."""
+        """Records the errors of the last samples, in [0, 1]; `mask` is False where none was measured."""
         measured = torch.ones_like(self.last_tiles) if mask is None else mask.to(self.last_tiles.device, torch.long)
-        whole = (errors.detach().to(self.last_tiles.device).nan_to_num(1.0).clamp(0, 1) * ERROR_SCALE).long() * measured
-        self.new_sums.index_add_(0, self.last_tiles, whole)
+        errors = errors.detach().to(self.last_tiles.device).nan_to_num(1.0).clamp(0, 1)
+        self.new_sums.index_add_(0, self.last_tiles, (errors * ERROR_SCALE).long() * measured)
         self.new_counts.index_add_(0, self.last_tiles, measured)
         self.num_updates += 1
         if self.num_updates % UPDATE_EVERY:
             return
         self.sums += self.new_sums / ERROR_SCALE
         self.counts += self.new_counts
-        kept = ERROR_WINDOW / self.counts.clamp_min(ERROR_WINDOW)
-        self.sums, self.counts = self.sums * kept, self.counts * kept
+        decay = ERROR_WINDOW / self.counts.clamp_min(ERROR_WINDOW)
+        self.sums, self.counts = self.sums * decay, self.counts * decay
         self.new_sums.zero_()
         self.new_counts.zero_()
         self._update_probabilities()
 
     def state_dict(self) -> dict[str, Tensor]:
-        """All that later draws depend on."""
+        """Everything that later samples depend on."""
         return {name: getattr(self, name) for name in STATE_KEYS} | {"num_updates": torch.tensor(self.num_updates)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Goes on from `state_dict`; the photos are the same."""
+        """Restores `state_dict`, for the same photos."""
         for name in STATE_KEYS:
             getattr(self, name).copy_(state[name])
         self.num_updates = int(state["num_updates"])

@@ -1,4 +1,4 @@
-"""The optics of one photo: its intrinsics and its lens, as calibration programs state them."""
+"""Intrinsics and lens distortion of one photo, in the terms of calibration programs."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from nerf_lightning.cameras import Cameras, Distortion, Lenses, Projection
 from nerf_lightning.cameras.lenses import directions_to_normalized, distort
 
 ROUNDTRIP_GRID, MAX_ROUNDTRIP_ERROR_PX = 24, 1.0
-"""Pixels along each side whose rays are tried, and how far from a pixel its ray may appear."""
+"""Pixels along each side of the round-trip check, and its largest reprojection error."""
 
 
 @dataclass(frozen=True)
@@ -34,22 +34,21 @@ class Intrinsics:
 
     @property
     def opencv_distortion(self) -> Float[np.ndarray, "5"]:
-        """k1, k2, p1, p2, k3, in OpenCV's order: all of a perspective lens's distortion that a calibration finds."""
+        """k1, k2, p1, p2, k3, OpenCV's order: the perspective distortion that calibration estimates."""
         d = self.distortion
         return np.array([d.k1, d.k2, d.p1, d.p2, d.k3])
 
     @property
     def is_distorted(self) -> bool:
-        """Whether it is not a pinhole camera's."""
+        """Whether this is not a pinhole camera."""
         return self.projection != Projection.PERSPECTIVE or any(self.distortion)
 
     def is_invertible(self) -> bool:
-        """Whether each pixel has a direction of its own, as with a real lens: rays through pixels all over the photo appear
-        where they were cast, unfolded, in the single precision of training, which a distortion may be too strong for."""
+        """Whether the distortion is invertible: pixels survive the round trip through rays in float32, without folding."""
         return not self.is_distorted or is_invertible(self)
 
 
-@lru_cache(maxsize=1)  # a lens is mostly that of all photos
+@lru_cache(maxsize=1)  # most captures have one lens
 def is_invertible(intrinsics: Intrinsics) -> bool:
     """See `Intrinsics.is_invertible`."""
     lenses = Lenses(torch.tensor([intrinsics.distortion]).float(), torch.tensor([intrinsics.projection]))
@@ -60,16 +59,15 @@ def is_invertible(intrinsics: Intrinsics) -> bool:
     )
     row, col = torch.cartesian_prod(down, across).T
     directions = cameras.generate_rays(torch.zeros_like(row), row, col).directions
-    places, _, _ = cameras.project(directions, 0)
-    off = places - torch.stack([col, row], dim=1) - 0.5
+    pixels, _, _ = cameras.project(directions, 0)
+    error = pixels - torch.stack([col, row], dim=1) - 0.5
     _, jacobian = distort(directions_to_normalized(directions, lenses.projection), lenses.coefficients)
-    return bool(
-        (off.abs() < MAX_ROUNDTRIP_ERROR_PX).all() and (torch.linalg.det(jacobian) > 0).all()
-    )  # false for nan too
+    # False for NaN too.
+    return bool((error.abs() < MAX_ROUNDTRIP_ERROR_PX).all() and (torch.linalg.det(jacobian) > 0).all())
 
 
 def make_equirectangular(width: int, height: int) -> Intrinsics:
-    """The optics of a photo of all directions, 360 degrees wide and 180 high, whose centre lies on the optical axis."""
+    """Intrinsics of an equirectangular panorama, 360 x 180 degrees, centred on the optical axis."""
     return Intrinsics(
         width,
         height,

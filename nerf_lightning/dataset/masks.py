@@ -1,4 +1,4 @@
-"""Masks beside photos: which file belongs to which photo, and what is masked."""
+"""Mask files: matching to photos, reading, and what they mask out."""
 
 import logging
 import os
@@ -18,27 +18,27 @@ from nerf_lightning.utils.text import join_truncated
 log = logging.getLogger(__name__)
 
 MASK_THRESHOLD = 128
-"""Brightness, or alpha, from which a mask keeps a pixel: white is kept, as nerfstudio and COLMAP have it."""
+"""Brightness (or alpha) from which a mask keeps a pixel: white is kept, as in nerfstudio and COLMAP."""
 MAX_NAMED = 4
-"""Masks that a message names."""
+"""Mask names in a message."""
 CELLS_PER_SIDE = 16
-"""Of a coarse grid over a photo, to see where most masks leave something out."""
+"""Side of the coarse grid in which masks are averaged to detect inverted ones."""
 MAX_COLOR_SPREAD = 12
-"""Of one colour, in 1/255, after JPEG."""
+"""Deviation from the median, in 1/255, within which JPEG pixels count as one colour."""
 
 
 def find_masks(photos: Sequence[Path], root: Path) -> list[Path | None]:
-    """Finds the mask of each photo in a folder `masks`, `mask`, `images_mask` or `images_masks` beside the photos' own.
+    """Finds the mask of each photo in a folder `masks`, `mask`, `images_mask` or `images_masks`.
 
-    A mask has the photo's path below its folder, or its name alone, perhaps with more at its end or another extension. Where
-    some photos have a mask and others none, those count whole; a line says so.
+    A mask has the photo's path below its folder, or only its name, possibly with a suffix or another extension. Photos
+    without a mask are used whole, with a warning.
 
     Args:
-        photos: their files.
-        root: the scene's folder.
+        photos: image files.
+        root: folder of the scene.
 
     Raises:
-        InputError: several masks may be meant, or one of several photos.
+        InputError: several masks match a photo, or several photos a mask.
     """
     for folder in (parent / name for parent in _mask_parents(photos, root) for name in MASK_FOLDERS):
         if folder.is_dir():
@@ -47,76 +47,75 @@ def find_masks(photos: Sequence[Path], root: Path) -> list[Path | None]:
         return [None] * len(photos)
     masks = [(fold_mask(file.relative_to(folder)), file) for file in walk_images(folder)]
     common = Path(os.path.commonpath([photo.parent for photo in photos]))
-    found = [match_mask(folder, normalize_name(str(photo.relative_to(common))), photo, masks) for photo in photos]
+    matches = [match_mask(folder, normalize_name(str(photo.relative_to(common))), photo, masks) for photo in photos]
     owners: dict[Path, Path] = {}
-    for photo, mask in zip(photos, found, strict=True):
+    for photo, mask in zip(photos, matches, strict=True):
         if mask is not None and (other := owners.setdefault(mask, photo)) != photo:
             text = f"one mask for {other.relative_to(common)} and {photo.relative_to(common)}"
-            raise InputError(mask, "", text, "a mask for each photo", "put masks into folders named as the photos'")
-    missing = [photo.name for photo, mask in zip(photos, found, strict=True) if mask is None]
+            raise InputError(mask, "", text, hint="put masks into folders named as the photos'")
+    missing = [photo.name for photo, mask in zip(photos, matches, strict=True) if mask is None]
     if len(missing) == len(photos):
-        log.warning("%s: no mask has the name of a photo, such as %s: masks left out", folder, photos[0].stem + ".png")
+        log.warning("%s: no mask matches a photo name, such as %s: masks ignored", folder, photos[0].stem + ".png")
     elif missing:
-        log.warning("%s: no mask for %d of %d photos, %s first", folder, len(missing), len(photos), missing[0])
-    return found
+        log.warning("%s: no mask for %d of %d photos, such as %s", folder, len(missing), len(photos), missing[0])
+    return matches
 
 
 def _mask_parents(photos: Sequence[Path], root: Path) -> list[Path]:
-    """Folders that may contain one of masks: above or in that of the photos, or the scene's."""
+    """Folders that may contain a mask folder: the photos', the one above, or the scene's."""
     common = Path(os.path.commonpath([photo.parent for photo in photos]))
     return list(dict.fromkeys([common.parent, common, photos[0].parent.parent, photos[0].parent, root]))
 
 
 def fold_mask(path: Path) -> tuple[str, ...]:
-    """The folded parts of a mask's path; COLMAP appends an extension to the photo's: `a.jpg.png` becomes `a`."""
+    """Normalized parts of a mask path. COLMAP appends an extension to the photo's: `a.jpg.png` becomes `a`."""
     return normalize_name("/".join(normalize_name(path.as_posix())))
 
 
 def match_mask(
     folder: Path, photo: tuple[str, ...], file: Path, masks: Sequence[tuple[tuple[str, ...], Path]]
 ) -> Path | None:
-    """Finds the one mask whose path, from its end on, is the photo's as far as both go.
+    """Finds the mask whose path and the photo's agree from the end, up to the shorter one.
 
     Args:
-        folder: of the masks, for messages.
-        photo: folded path below the folder that all photos share.
+        folder: mask folder, for messages.
+        photo: normalized path below the common folder of all photos.
         file: the photo.
-        masks: folded paths below their folder, and files.
+        masks: normalized paths below their folder, and files.
 
     Raises:
-        InputError: several fit.
+        InputError: several masks match.
     """
 
     def fits(mask: tuple[str, ...], exact: bool) -> bool:
         name, base = mask[-1], photo[-1]
-        longer = name.startswith(base) and len(name) > len(base) and not name[len(base)].isalnum()
+        extended = name.startswith(base) and len(name) > len(base) and not name[len(base)].isalnum()
         shared = min(len(mask), len(photo)) - 1
-        return (name == base if exact else longer) and mask[-1 - shared : -1] == photo[-1 - shared : -1]
+        return (name == base if exact else extended) and mask[-1 - shared : -1] == photo[-1 - shared : -1]
 
     found = [path for mask, path in masks if fits(mask, True)] or [path for mask, path in masks if fits(mask, False)]
     if len(found) > 1:
         shown = join_truncated([path.relative_to(folder).as_posix() for path in found], MAX_NAMED)
-        raise InputError(folder, "", f"{len(found)} masks for {file.name}: {shown}", "one mask for each photo")
+        raise InputError(folder, "", f"{len(found)} masks for {file.name}: {shown}", hint="keep one")
     return found[0] if found else None
 
 
 def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.ndarray, "H W"]:
-    """A mask in the size of its photo: 255 where the photo is kept, 0 where it is masked, and between where a pixel of the
-    photo is of several of the mask.
+    """Reads a mask at the size of its photo: 255 keeps a pixel, 0 masks it, values between are area averages.
 
     Raises:
-        InputError: no picture.
+        InputError: not an image.
     """
     pixels = read_pixels(path)
     grey = pixels[..., 3] if pixels.shape[2] == 4 else pixels.max(axis=2)
     mask = np.where(grey >= MASK_THRESHOLD, 255, 0).astype(np.uint8)
     mask = 255 - mask if invert else mask
-    way = cv2.INTER_AREA if mask.shape[1] >= width and mask.shape[0] >= height else cv2.INTER_NEAREST
-    return np.asarray(cv2.resize(mask, (width, height), interpolation=way), np.uint8)
+    interpolation = cv2.INTER_AREA if mask.shape[1] >= width and mask.shape[0] >= height else cv2.INTER_NEAREST
+    return np.asarray(cv2.resize(mask, (width, height), interpolation=interpolation), np.uint8)
 
 
 def is_cut_out_by_mask(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray, "H W"]) -> bool:
-    """Whether what a mask leaves out is most of the photo's border, and of one colour: its subject is cut out already."""
+    """True if the masked region covers most of the border in one colour, that is, the subject was cut out."""
     if extract_border(kept).mean() > 0.5:
         return False
     masked = image[..., :3][~kept]
@@ -125,7 +124,7 @@ def is_cut_out_by_mask(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray,
 
 
 def is_inverted(masks: Sequence[Bool[np.ndarray, "_ _"]]) -> bool:
-    """Whether masks leave out one spot in the middle of most photos and keep the borders: what is photographed, it seems."""
+    """True if most masks remove a region in the middle and keep the borders: probably the subject."""
     grid = CELLS_PER_SIDE, CELLS_PER_SIDE
     small = [cv2.resize(kept.astype(np.float32), grid, interpolation=cv2.INTER_AREA) for kept in masks]
     kept = np.mean(small, axis=0)

@@ -1,4 +1,4 @@
-"""Posed photos on disk become a Scene, whatever format named them."""
+"""Loads posed photos (decoding, masks, resizing) into Views."""
 
 import logging
 from collections.abc import Sequence
@@ -29,24 +29,24 @@ log = logging.getLogger(__name__)
 MaskMeaning = Literal["auto", "ignore", "background"]
 Orientation = Literal["auto", "stored", "exif"]
 MAX_INSPECTED_MASKS, INSPECTED_SIDE_PX = 8, 1000
-"""Photos, evenly chosen, that tell what their masks mean, and the size at which that shows."""
+"""Evenly spaced photos whose masks are inspected, and their longest side then."""
 MIN_VALID_COVERAGE = 250
-"""Share of a pixel, in 1/255, that must be known after averaging for the pixel to be known."""
+"""Mask coverage, in 1/255, from which an area-averaged pixel is valid."""
 
 
 @dataclass(frozen=True)
 class PhotoLoadOptions:
-    """How posed photos are read.
+    """Options for reading posed photos.
 
     Args:
-        resize: longest side in pixels after averaging, for photos that are larger; "auto" or an `AutoResize` chooses it, None
-            keeps their size.
-        holdout: every N-th photo is held out, in the order of their names, where the format has no split of its own.
-        masked: what masks and alpha leave out: "ignore" (a passer-by: not drawn, not scored) or "background" (the subject is
-            cut out); "auto" takes alpha as empty, and masks as empty where what they leave out is of one colour.
+        resize: longest side in pixels, to which larger photos are area-averaged; "auto" or an `AutoResize` chooses it, None
+            keeps the size.
+        holdout: hold out every N-th photo, sorted by name, if the format defines no split.
+        masked: meaning of masked or transparent pixels: "ignore" (unknown: not sampled, not scored) or "background" (the
+            subject is cut out); "auto" takes alpha, and masks whose masked region has one colour, as background.
         invert_masks: masks are black where the photo is kept.
-        bounded: "true", "false", or "auto", which decides by what the photos show, see `dataset.kind`.
-        orientation: "stored", "exif", or "auto", see `dataset.orientation`.
+        bounded: "true", "false", or "auto" to classify the photos, see `classify_scene`.
+        orientation: "stored", "exif" or "auto", see `choose_orientations`.
     """
 
     resize: int | str | AutoResize | None = None
@@ -62,25 +62,25 @@ DEFAULT_OPTIONS = PhotoLoadOptions()
 
 @dataclass(frozen=True)
 class PosedPhoto:
-    """One posed photo."""
+    """One photo with its pose, intrinsics and mask."""
 
     name: str
-    """As its format names it."""
+    """As in the scene file."""
     file: Path
     c2w: Float[np.ndarray, "4 4"]
     """Camera to world, OpenCV, the file's world frame and unit."""
     intrinsics: Intrinsics
-    """Of the photo's size, or of the same photo at another one."""
+    """At the photo's size or a multiple of it."""
     mask: Path | None = None
     upright: bool = False
-    """Whether the pose and optics are those of the photo as its EXIF data turn it."""
+    """Whether pose and intrinsics refer to the EXIF-rotated photo."""
 
 
 def load_views(source: Path, photos: Sequence[PosedPhoto], options: PhotoLoadOptions) -> Views:
-    """Decodes photos, averaged to the size that is asked for. Poses stay in the file's frame.
+    """Decodes photos and area-averages them to the requested size. Poses stay in the file's frame.
 
     Raises:
-        InputError: a photo that cannot be read or has another shape than its camera, or more photos than fit into memory.
+        InputError: a photo is unreadable or does not match its camera's size, or the photos do not fit into memory.
     """
     headers = [read_image_size(photo.file, photo.upright) for photo in photos]
     for photo, (width, height, _) in zip(photos, headers, strict=True):
@@ -92,10 +92,10 @@ def load_views(source: Path, photos: Sequence[PosedPhoto], options: PhotoLoadOpt
     sizes = [(width, height) for width, height, _ in headers]
     longest = choose_resize(source, sizes, channels, options.resize)
     sizes = [fit_size(*size, longest) for size in sizes]
-    starts = np.cumsum([0] + [width * height for width, height in sizes])
-    check_memory(source, "", f"{len(photos)} photos", float(starts[-1]) * channels, "give a smaller dataset.resize")
-    pixels = np.empty((starts[-1], channels), np.uint8)
-    known = np.ones(starts[-1] if masked or has_alpha else 0, bool)
+    offsets = np.cumsum([0] + [width * height for width, height in sizes])
+    check_memory(source, "", f"{len(photos)} photos", float(offsets[-1]) * channels, "give a smaller dataset.resize")
+    pixels = np.empty((offsets[-1], channels), np.uint8)
+    valid = np.ones(offsets[-1] if masked or has_alpha else 0, bool)
 
     def read(i: int) -> None:
         file = photos[i].file if longest is None else find_downscaled(photos[i].file, sizes[i], photos[i].upright)
@@ -103,10 +103,10 @@ def load_views(source: Path, photos: Sequence[PosedPhoto], options: PhotoLoadOpt
         mask_file, (height, width) = photos[i].mask, image.shape[:2]
         mask = None if mask_file is None else read_mask(mask_file, width, height, options.invert_masks)
         image, mask = merge_mask(image, mask, channels, is_cutout)
-        part = slice(starts[i], starts[i + 1])
+        part = slice(offsets[i], offsets[i + 1])
         pixels[part] = resize_area(image, *sizes[i]).reshape(-1, channels)
         if mask is not None:
-            known[part] = cv2.resize(mask, sizes[i], interpolation=cv2.INTER_AREA).ravel() >= MIN_VALID_COVERAGE
+            valid[part] = cv2.resize(mask, sizes[i], interpolation=cv2.INTER_AREA).ravel() >= MIN_VALID_COVERAGE
 
     with ThreadPoolExecutor(MAX_DECODE_THREADS) as pool:
         for _ in track_progress(pool.map(read, range(len(photos))), len(photos), "reading photos"):
@@ -115,29 +115,28 @@ def load_views(source: Path, photos: Sequence[PosedPhoto], options: PhotoLoadOpt
     return Views(
         torch.from_numpy(pixels),
         make_cameras(photos).resize(torch.tensor(sizes)),
-        None if known.all() else torch.from_numpy(known),
+        None if valid.all() else torch.from_numpy(valid),
         tuple(photo.name for photo in photos),
         tuple(exposures) if len(exposures) == len(photos) else (),
     )
 
 
 def check_photo_shape(source: Path, photo: PosedPhoto, width: int, height: int) -> None:
-    """Refuses a photo that cannot be of its camera."""
+    """Raises InputError if a photo does not have its camera's aspect ratio."""
     stated = photo.intrinsics.width, photo.intrinsics.height
     if not has_same_aspect((width, height), stated):
-        expected = f"{stated[0]}x{stated[1]}, the size of its camera, or the same reduced"
+        expected = f"{stated[0]}x{stated[1]}, the size of its camera, or a reduced copy"
         raise InputError(photo.file, "", f"{width}x{height} pixels", expected, f"are these the photos of {source}?")
 
 
 def merge_mask(
     image: UInt8[np.ndarray, "H W _"], mask: UInt8[np.ndarray, "H W"] | None, channels: int, is_cutout: bool
 ) -> tuple[UInt8[np.ndarray, "H W C"], UInt8[np.ndarray, "H W"] | None]:
-    """A photo with so many channels, and its mask: one that cuts out goes into the alpha, an alpha without a channel into the
-    mask."""
+    """Converts a photo to `channels` and merges its mask: cutouts into alpha, alpha without a channel into the mask."""
     rgb, alpha = image[..., :3], image[..., 3] if image.shape[2] == 4 else None
     if channels == 3:
-        both = [cover for cover in (mask, alpha) if cover is not None]
-        return np.ascontiguousarray(rgb), np.minimum.reduce(both) if both else None
+        masks = [x for x in (mask, alpha) if x is not None]
+        return np.ascontiguousarray(rgb), np.minimum.reduce(masks) if masks else None
     alpha = np.full(image.shape[:2], 255, np.uint8) if alpha is None else alpha
     if is_cutout:
         alpha, mask = (alpha if mask is None else np.minimum(alpha, mask)), None
@@ -145,34 +144,34 @@ def merge_mask(
 
 
 def make_cameras(photos: Sequence[PosedPhoto]) -> Cameras:
-    """The cameras of photos at the sizes that their intrinsics are of; poses in double precision."""
+    """Builds the cameras of photos at the size of their intrinsics; poses in float64."""
     intrinsics = [photo.intrinsics for photo in photos]
     lenses = None
-    if any(one.is_distorted for one in intrinsics):
-        coefficients = torch.tensor([one.distortion for one in intrinsics])
-        lenses = Lenses(coefficients.float(), torch.tensor([one.projection for one in intrinsics]))
-    K, c2w = (torch.from_numpy(np.stack(x)) for x in ([one.K for one in intrinsics], [photo.c2w for photo in photos]))
-    return Cameras(K.float(), c2w, torch.tensor([(one.width, one.height) for one in intrinsics]), lenses)
+    if any(i.is_distorted for i in intrinsics):
+        coefficients = torch.tensor([i.distortion for i in intrinsics])
+        lenses = Lenses(coefficients.float(), torch.tensor([i.projection for i in intrinsics]))
+    K, c2w = (torch.from_numpy(np.stack(x)) for x in ([i.K for i in intrinsics], [photo.c2w for photo in photos]))
+    return Cameras(K.float(), c2w, torch.tensor([(i.width, i.height) for i in intrinsics]), lenses)
 
 
 def interpret_masks(photos: Sequence[PosedPhoto], options: PhotoLoadOptions) -> str | None:
-    """What masks in files of their own leave out, see `PhotoLoadOptions`; None where there are none. A few are looked at."""
+    """Decides from a few mask files what masked pixels mean, see `PhotoLoadOptions.masked`; None without masks."""
     masks = [(photo, photo.mask) for photo in photos if photo.mask is not None]
     if not masks:
         return None
     kept: list[Bool[np.ndarray, "_ _"]] = []
-    cut = []
+    cutouts = []
     for photo, mask in (masks[i] for i in subsample(len(masks), MAX_INSPECTED_MASKS)):
         size = read_image_size(photo.file, photo.upright)[:2]
         image = read_pixels(photo.file, photo.upright, fit_size(*size, INSPECTED_SIDE_PX))
         kept.append(read_mask(mask, image.shape[1], image.shape[0], options.invert_masks) >= MASK_THRESHOLD)
-        cut.append(is_cut_out_by_mask(image, kept[-1]))
+        cutouts.append(is_cut_out_by_mask(image, kept[-1]))
     if is_inverted(kept):
-        text = "most masks leave out one spot in the middle: are they inverted? dataset.invert_masks=%s takes them so"
+        text = "most masks remove a region in the middle: are they inverted? Set dataset.invert_masks=%s if so"
         log.warning(text, str(not options.invert_masks).lower())
     meaning = options.masked
     if meaning == "auto":
-        meaning = "background" if np.mean(cut) > 0.5 else "ignore"
-    share = 1 - float(np.mean([one.mean() for one in kept]))
-    log.info("masks leave out about %.0f %% of the pixels: taken as %s", 100 * share, meaning)
+        meaning = "background" if np.mean(cutouts) > 0.5 else "ignore"
+    masked_fraction = 1 - float(np.mean([mask.mean() for mask in kept]))
+    log.info("masks remove about %.0f %% of the pixels, treated as %s", 100 * masked_fraction, meaning)
     return meaning

@@ -1,4 +1,4 @@
-"""PixelDataModule: places in a picture and their colours."""
+"""PixelDataModule: pixel coordinates of a picture and their colours."""
 
 import hashlib
 from collections.abc import Callable
@@ -16,14 +16,14 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.tensor_dataclass import TensorDataclass
 
 DEFAULT_PIXELS = 8192
-"""Pixels a step, where a picture is not large."""
+"""Pixels per step, except for large pictures."""
 MIN_PIXEL_FRACTION = 1 / 128
-"""Least share of a picture that a step looks at: an optimiser's step passes over all numbers of a field, of which large
-pictures have many. On 16 million pixels, 777 steps of 8192 gave 34.6 dB and, in the same time, 496 of 131,072 gave 39.9."""
+"""Minimum batch size as a fraction of the picture: the optimizer updates all parameters, of which large pictures have many.
+On 16 million pixels, 777 steps of 8192 gave 34.6 dB and, in the same time, 496 of 131,072 gave 39.9."""
 
 
 def no_larger_picture(width: int, height: int) -> None:
-    """`Picture.make_reference` of a picture whose larger versions are unknown."""
+    """Default `Picture.make_reference`: larger versions are unknown."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,9 @@ class Picture:
     image: UInt8[Tensor, "H W 3"]
     """sRGB."""
     make_reference: Callable[[int, int], UInt8[Tensor, "h w 3"] | None] = no_larger_picture
-    """Width, height -> the true picture at that size, or None if unknown."""
+    """(width, height) -> ground truth at that size, or None if unknown."""
     test: ClassVar[None] = None
-    """It has no test split."""
+    """No test split."""
 
     @property
     def size(self) -> tuple[int, int]:
@@ -46,11 +46,11 @@ class Picture:
         return width, height
 
     def sha256(self) -> str:
-        """A fingerprint of the pixels."""
+        """Hash of shape and pixels."""
         return hashlib.sha256(repr(tuple(self.image.shape)).encode() + self.image.numpy().tobytes()).hexdigest()
 
     def describe(self) -> dict[str, object]:
-        """Which picture this is, for results.json."""
+        """Metadata of the picture for results.json."""
         return {
             "name": self.name,
             "source": self.source,
@@ -62,7 +62,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class PixelBatch(TensorDataclass):
-    """N places and their colours."""
+    """N pixel coordinates and their colours."""
 
     uv: Float[Tensor, "N 2"]
     """In [0, 1]^2, x right, y down; the centre of pixel (row, col) is ((col + 0.5) / W, (row + 0.5) / H)."""
@@ -71,7 +71,7 @@ class PixelBatch(TensorDataclass):
 
 @dataclass(frozen=True)
 class PictureBatch(PixelBatch):
-    """Pixels of a picture, row by row; N = height * width."""
+    """Pixels of a picture, row-major; N = height * width."""
 
     height: int
     width: int
@@ -82,20 +82,20 @@ class PictureBatch(PixelBatch):
 
 
 def pixel_grid(height: int, width: int, subset: PixelSubset = ALL_PIXELS) -> Float[Tensor, "N 2"]:
-    """The centres of pixels, row by row, see `PixelBatch`."""
+    """Pixel centres, row-major, see `PixelBatch.uv`."""
     rows, columns = subset.grid(width, height)
     x, y = (columns + 0.5) / width, (rows + 0.5) / height
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).view(-1, 2)
 
 
 class PixelDataModule(StepDataModule[Tensor]):
-    """Feeds NeRF2D. There is nothing to hold out: quality is measured on all pixels.
+    """Pixel batches for NeRF2D. Nothing is held out: quality is measured on all pixels.
 
     Args:
-        scene: the picture.
-        pixels: pixels a step, drawn with replacement; several processes share them. None: 8192, and of more than a million
-            pixels 1 in 128.
-        seed: of the draw.
+        scene: picture to fit.
+        pixels: batch size over all processes, sampled with replacement; None: 8192, or 1/128 of pictures above a
+            megapixel.
+        seed: random seed of the sampling.
     """
 
     is_posed = False
@@ -107,7 +107,7 @@ class PixelDataModule(StepDataModule[Tensor]):
         self.pixels = pixels or max(DEFAULT_PIXELS, round(MIN_PIXEL_FRACTION * self.count_held_out_pixels(0)))
 
     def scale_batch(self, factor: int) -> None:
-        """Takes that many times the pixels a step, for a device that takes more at once. Before training."""
+        """Multiplies the batch size, for larger devices. Call before training."""
         self.pixels *= factor
 
     def draw_batch(self, photos: UInt8[Tensor, "H W 3"], step: int, part: slice) -> PixelBatch:
@@ -118,11 +118,11 @@ class PixelDataModule(StepDataModule[Tensor]):
         return PixelBatch(uv, photos.view(-1, 3)[index].float() / 255)
 
     def make_warmup_batch(self) -> PixelBatch:
-        """A few places, to compile kernels with."""
+        """A small random batch for compiling kernels."""
         return PixelBatch(*torch.rand(64, 5, generator=step_generator(0, Stream.BATCH, 0)).split([2, 3], dim=1))
 
     def make_baseline_batch(self) -> PixelBatch:
-        """As in `RayDataModule`; here, all pixels."""
+        """All pixels, see `RayDataModule.make_baseline_batch`."""
         return self.get_held_out_view(0)
 
     def count_held_out_pixels(self, view: int) -> int:
@@ -130,7 +130,7 @@ class PixelDataModule(StepDataModule[Tensor]):
         return width * height
 
     def get_held_out_view(self, view: int, subset: PixelSubset = ALL_PIXELS) -> PictureBatch:
-        """The picture."""
+        """Loads the picture, or a subset of its pixels."""
         width, height = self.scene.size
         rows, columns = subset.grid(width, height)
         rgb = self.scene.image[rows][:, columns].view(-1, 3).float().div_(255)  # in place: large pictures

@@ -1,4 +1,4 @@
-"""RayDataModule: rays and their pixels, drawn from all training photos."""
+"""RayDataModule: rays and pixels sampled from all training photos."""
 
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -20,16 +20,16 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.utils.tensor_dataclass import TensorDataclass
 
 DEFAULT_RAYS, DEFAULT_SAMPLES = 1024, 16384
-"""Rays of the first step, and the samples per step that the number of rays then adapts to."""
+"""Rays in the first step, and target samples per step to which the number of rays adapts."""
 ErrorSampling = Annotated[float, Ge(0), Le(0.99)]
 DEFAULT_ERROR_SAMPLING = 0.5
-"""Share of the rays that are drawn by the error around them."""
+"""Fraction of the rays sampled by error."""
 BASELINE_PIXELS = 8192
-"""Pixels drawn to measure the error of one plain colour."""
+"""Pixels on which the constant-colour baseline is measured."""
 TEXTURE_RADIUS = 0.0125
-"""How far from a pixel its photo is looked at for `measure_texturelessness`, in longer sides of the photo."""
+"""Distance of the neighbours in `measure_texturelessness`, relative to the photo's longest side."""
 TEXTURE_CONTRAST = 0.01
-"""Difference of colours at which a photo is plain by 1/e: two or three steps of 8 bits, hardly more than their noise."""
+"""Contrast at which texturelessness is 1/e: two or three 8-bit levels, about the noise."""
 
 
 @dataclass(frozen=True)
@@ -40,57 +40,56 @@ class RayBatch(TensorDataclass):
     pixels: UInt8[Tensor, "R C"]
     """sRGB, with straight alpha where C is 4."""
     views: Int[Tensor, "R"] | None = field(default=None, kw_only=True)
-    """The training photo that each belongs to; None where that is not asked for."""
+    """Training photo of each ray; None if not requested."""
     texturelessness: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
-    """Of the photo around each, see `measure_texturelessness`; None where that is not asked for."""
+    """See `measure_texturelessness`; None if not requested."""
     weights: Float[Tensor, "R"] | None = field(default=None, kw_only=True)
-    """How much each counts, see `ErrorSampler`; None where all count the same."""
+    """Importance weights, see `ErrorSampler`; None for uniform sampling."""
 
 
 @dataclass(frozen=True)
 class ViewBatch(RayBatch):
-    """Rays of one view, row by row; R = height * width."""
+    """Rays of one view, row-major; R = height * width."""
 
     height: int
     width: int
     valid_mask: Bool[Tensor, "R"] | None = None
-    """Which pixels count; None for all."""
+    """Unmasked pixels; None for all."""
     strip: int | None = None
     """See `PixelSubset.strip`."""
 
 
 def cast_rays(views: Views, pixels: Int[Tensor, "R"]) -> tuple[Rays, Int[Tensor, "R"]]:
-    """Rays through the pixels at these places in `Views.pixels`, and the photos they belong to."""
-    pixels = pixels.contiguous()  # of several processes each has every so many
+    """Generates the rays through pixels, given as indices into `Views.pixels`, and returns their photos."""
+    pixels = pixels.contiguous()  # each rank has a strided slice
     view = torch.searchsorted(views.offsets, pixels, right=True) - 1
     pixel, width = pixels - views.offsets[view], views.widths[view]
     return views.cameras.generate_rays(view, pixel // width, pixel % width), view
 
 
 def make_view_batch(views: Views, view: int, subset: PixelSubset = ALL_PIXELS) -> ViewBatch:
-    """One view, or some of its pixels."""
+    """Builds a batch of one view, or of a subset of its pixels."""
     rows, columns = subset.grid(*views.cameras.size(view))
     row, column = (x.flatten() for x in torch.meshgrid(rows, columns, indexing="ij"))
     rays = views.cameras.generate_rays(torch.full_like(row, view), row, column)
-    known = None if views.valid_mask is None else views.view_mask(view)[row, column]
-    return ViewBatch(rays, views.image(view)[row, column], len(rows), len(columns), known, subset.strip)
+    valid = None if views.valid_mask is None else views.view_mask(view)[row, column]
+    return ViewBatch(rays, views.image(view)[row, column], len(rows), len(columns), valid, subset.strip)
 
 
 def measure_texturelessness(views: Views, pixels: Int[Tensor, "R"], view: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
-    """How textureless photos are around the pixels at these places in `Views.pixels`: 1 where the colour is the same on all
-    four sides, falling toward 0 with its largest difference.
+    """Texturelessness in [0, 1] around each pixel: 1 if its four neighbours have the same colour, else exp(-contrast).
 
-    Such places look alike in photos from elsewhere too, so that these hardly tell how far they are.
+    Photos barely constrain the depth of textureless surfaces.
     """
     start, width = views.offsets[view], views.widths[view]
     pixel, height = pixels - start, (views.offsets[view + 1] - start) // width
     row, column = pixel // width, pixel % width
-    reach = (TEXTURE_RADIUS * torch.maximum(width, height)).round().long().clamp_min(1)
+    offset = (TEXTURE_RADIUS * torch.maximum(width, height)).round().long().clamp_min(1)
     sides = (
-        start + row * width + (column - reach).clamp_min(0),
-        start + row * width + torch.minimum(column + reach, width - 1),
-        start + (row - reach).clamp_min(0) * width + column,
-        start + torch.minimum(row + reach, height - 1) * width + column,
+        start + row * width + (column - offset).clamp_min(0),
+        start + row * width + torch.minimum(column + offset, width - 1),
+        start + (row - offset).clamp_min(0) * width + column,
+        start + torch.minimum(row + offset, height - 1) * width + column,
     )
     here = views.pixels[pixels].short()
     contrast = torch.stack([(views.pixels[side].short() - here).abs().amax(1) for side in sides]).amax(0)
@@ -100,9 +99,9 @@ def measure_texturelessness(views: Views, pixels: Int[Tensor, "R"], view: Int[Te
 def make_batch(
     views: Views, pixels: Int[Tensor, "R"], with_texture: bool = False, weights: Float[Tensor, "R"] | None = None
 ) -> RayBatch:
-    """Rays and pixels at these places in `Views.pixels`; `weights` and, if asked for, `texturelessness` as in `RayBatch`.
+    """Builds a batch of the given indices into `Views.pixels`.
 
-    Photos stay bytes, and rays are made only for these pixels: the cost does not depend on the number of photos.
+    Photos stay uint8 and rays are generated for these pixels only: the cost does not depend on the number of photos.
     """
     rays, view = cast_rays(views, pixels)
     textureless = measure_texturelessness(views, pixels, view) if with_texture else None
@@ -110,14 +109,14 @@ def make_batch(
 
 
 class RayDataModule(StepDataModule[Views]):
-    """Feeds NeRF3D.
+    """Ray batches for NeRF3D.
 
     Args:
-        scene: the photos and cameras.
-        rays: rays a step, which several processes share; with `samples`, only of the first.
-        samples: aim for this many samples a step by adapting the number of rays; None keeps `rays`.
-        seed: of the draw.
-        error_sampling: fraction of the rays drawn by the error around them, see `ErrorSampler`; 0 draws uniformly.
+        scene: photos and cameras.
+        rays: rays per step over all processes; with `samples`, in the first step.
+        samples: target samples per step, by adapting the number of rays; None keeps `rays`.
+        seed: random seed of the sampling.
+        error_sampling: fraction of the rays sampled by error, see `ErrorSampler`; 0 samples uniformly.
     """
 
     is_posed = True
@@ -138,41 +137,39 @@ class RayDataModule(StepDataModule[Views]):
         self.error_sampling = error_sampling
         self._error_sampler: ErrorSampler | None = None
         self._sampler_state: dict[str, Tensor] = {}
-        """What `_error_sampler` goes on from, when photos are drawn from for the first time."""
+        """Saved state that `_error_sampler` is created from."""
         self._with_texture = False
         self._resolution_scale = 1.0
 
     def scale_batch(self, factor: int) -> None:
-        """Takes that many times the rays and samples a step, for a device that takes more at once. Before training."""
+        """Multiplies rays and samples per step, for larger devices. Call before training."""
         self.rays = self.initial_rays = self.initial_rays * factor
         self.samples = None if self.samples is None else self.samples * factor
 
     def enable_texturelessness(self, is_enabled: bool) -> None:
-        """Sets whether batches say how textureless photos are."""
+        """Sets whether batches contain `texturelessness`."""
         self._with_texture = is_enabled
 
     def set_resolution_scale(self, scale: float) -> None:
-        """Sets the factor on the samples aimed for, see `Field.resolution_scale`: fewer meet in a small cell, and gradients
-        would be noise."""
+        """Scales the target samples with `Field.resolution_scale`: smaller cells get fewer samples and noisier gradients."""
         self._resolution_scale = scale
 
-    def adapt_num_rays(self, drawn: int) -> None:
-        """Called with the samples that a step's rays took: moves the number of rays toward the aim."""
+    def adapt_num_rays(self, num_samples: int) -> None:
+        """Moves the number of rays toward the target samples, given those of the last step."""
         if self.samples is None:
             return
-        # Damped, since one batch's count is noisy; bounded, since empty space would ask for endless rays.
-        wanted = self.rays * round(self.samples * self._resolution_scale) / max(drawn, 1)
+        # Damped, since one batch's count is noisy; bounded, since empty space would need infinitely many rays.
+        target = self.rays * round(self.samples * self._resolution_scale) / max(num_samples, 1)
         limit = self.initial_rays * self.MAX_RAYS_FACTOR
-        self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(wanted, limit))))
+        self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(target, limit))))
 
     def update_error_map(self, errors: Float[Tensor, "R"], mask: Bool[Tensor, "R"] | None = None) -> None:
-        """Called after each step with the squared errors of all its rays, those of other processes too, and which of them were
-        measured: later steps look more where they are large."""
+        """Records the squared errors of a step's rays, over all processes, for error sampling; `mask` as in `ErrorSampler`."""
         if self._error_sampler is not None:
             self._error_sampler.update(errors, mask)
 
     def reset(self) -> None:
-        """Before another training on the same photos: nothing is known of errors, and a first step's number of rays."""
+        """Resets the error map and the adaptive ray count for a new training."""
         self.rays = self.initial_rays
         self._error_sampler, self._sampler_state = None, {}
 
@@ -185,20 +182,19 @@ class RayDataModule(StepDataModule[Views]):
                 self._sampler_state if self._error_sampler is None else self._error_sampler.state_dict()
             )
             self._error_sampler = ErrorSampler(photos, self.error_sampling)
-            if len(self._sampler_state.get("sums", ())) == len(
-                self._error_sampler.sums
-            ):  # else of other photos, or of none
+            # The state is empty, or of other photos, if the numbers of tiles differ.
+            if len(self._sampler_state.get("sums", ())) == len(self._error_sampler.sums):
                 self._error_sampler.load_state_dict(self._sampler_state)
         pixels, weights = self._error_sampler.draw(self.rays, generator)
         return make_batch(photos, pixels[part], self._with_texture, weights[part])
 
     def make_baseline_batch(self) -> RayBatch:
-        """Training pixels to measure the error of one plain colour on."""
+        """Samples training pixels for the constant-colour baseline."""
         generator = step_generator(self.seed, Stream.BASELINE, 0)
         return make_batch(self.scene.train, self.scene.train.sample_pixels(BASELINE_PIXELS, generator))
 
     def make_warmup_batch(self) -> RayBatch:
-        """A few rays, to compile kernels with."""
+        """A small batch for compiling kernels."""
         generator = step_generator(0, Stream.BATCH, 0)
         return make_batch(self.scene.train, self.scene.train.sample_pixels(64, generator), with_texture=True)
 

@@ -1,4 +1,4 @@
-"""The region of detail: where a capture's photos look at once, and the unit of length that fits it."""
+"""Region of interest of a capture: the centre that the photos share, and a matching unit of length."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -12,37 +12,37 @@ from nerf_lightning.cameras import CameraLayout, classify_layout
 from nerf_lightning.cameras.camera_layout import MAX_POINTS, axis_cosines, centre_spread, find_convergence, median_depth
 
 MAX_VIEWS = 128
-"""Evenly chosen views that tell where points are looked at."""
+"""Evenly spaced views used to score points."""
 MIN_POINTS = 16
-"""Fewer points than this say nothing about depth."""
+"""Points needed to estimate depth."""
 MAX_MEAN_DIRECTION = 0.5
-"""Mean of the unit vectors from the centre to cameras up to which they stand all around it: poses tell the centre."""
+"""Norm of the mean unit vector from centre to cameras up to which they surround it: poses alone determine the centre."""
 MIN_VIEW_COSINE = 0.8
-"""Cosine of half the angle of the cone in which a camera counts as looking at a point."""
+"""Cosine of the half-angle of the cone in which a camera looks at a point."""
 MIN_SCORE = 0.5
-"""Points count that photos look at at least so much as at most others, see `find_overlap_centre`."""
+"""Minimum score of a point relative to the 95 % quantile, see `find_overlap_centre`."""
 PAN_DEPTH = 4.0
-"""Units from a pan's camera to what it sees. Nothing is near the camera, so the box need not reach what it sees: in a room seen
-from its middle, held-out views were 24.1, 26.1 and 22.2 dB at 0.8, 4 and 20 units."""
+"""Units from a pan's camera to the content. Nothing is near the camera, so the box need not reach the content: in a room
+captured from its middle, held-out views were 24.1, 26.1 and 22.2 dB at 0.8, 4 and 20 units."""
 FORWARD_DEPTH, PAN_UNIT, WALK_UNIT = 4.0, 10.0, 2.0
-"""Depth of a forward-facing scene and units of a pan and of a walk, in spreads of the cameras' centres, where nothing tells."""
+"""Fallback depth of a forward-facing scene and units of a pan and a walk, relative to the spread of camera centres."""
 CAMERA_QUANTILE = 0.9
-"""Share of a walk's cameras that the box holds."""
+"""Fraction of a walk's cameras inside the box."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """A cube that deserves full detail, in the poses' frame and unit."""
+    """Cube of full detail, in the frame and unit of the poses."""
 
     layout: CameraLayout
     centre: Float[Tensor, "3"]
-    """Double precision."""
+    """float64."""
     unit: float
-    """Half the cube's edge: the cameras' median distance to the centre where they look at it, else that of what they see."""
+    """Half the cube's edge: median camera distance to the centre (subject), or else to the content."""
     has_depth: bool = True
-    """Whether poses or points tell how deep the scene is; else `unit` is a guess from how far apart the cameras are."""
+    """Whether poses or points determine the depth; else `unit` is a guess from the spread of the cameras."""
     points: Float[Tensor, "P 3"] | None = None
-    """On surfaces, given or found by matching."""
+    """Surface points, from the file or triangulated."""
 
     @property
     def has_subject(self) -> bool:
@@ -55,21 +55,21 @@ def find_region(
     points: Float[Tensor, "P 3"] | None = None,
     match: Callable[[], Float[Tensor, "M 3"] | None] | None = None,
 ) -> Region:
-    """Finds the region that photos show, by how their cameras are laid out.
+    """Finds the region of interest from the camera layout.
 
-    Inward: where the axes converge, all around it; from one side only, where the points are that most photos look at from
-    the most different directions. Forward: likewise, or where axes converge. Pan: around the camera, a share of the way to
-    what it sees. Walk: around the cameras, or as wide as what they see is far.
+    Inward: the convergence point of the axes; with cameras on one side only, the points with the best triangulation score.
+    Forward: likewise. Pan: around the camera, a fraction of the content's depth. Walk: around the cameras, as wide as the
+    content's depth.
 
     Args:
         c2w: OpenCV, any frame; at least one.
-        points: on surfaces, in that frame, where a file brings them.
-        match: finds points between photos; called only where poses alone do not tell the depth.
+        points: surface points in that frame, if the file has them.
+        match: triangulates points; called only if poses alone do not determine the depth.
     """
     origin = c2w[:, :3, 3].double().median(0).values
     moves = centre_spread(c2w) > 0
     local = c2w.double().clone()
-    local[:, :3, 3] = (local[:, :3, 3] - origin) * moves  # what is left of one place is rounding
+    local[:, :3, 3] = (local[:, :3, 3] - origin) * moves  # identical centres differ by rounding only
     target = find_convergence(local)
     if (points is None or len(points) < MIN_POINTS) and moves and target is None and match is not None:
         points = match()
@@ -88,23 +88,23 @@ def _make_subject_region(
     target: Float[Tensor, "3"] | None,
     points: Float[Tensor, "P 3"] | None,
 ) -> Region:
-    """What cameras look at together; `target` is where their axes converge, if they do."""
+    """Region of a subject; `target` is the convergence point of the axes, if any."""
     centres = c2w[:, :3, 3]
     centre = target
     one_sided = target is None or float(normalize(centres - target, dim=1).mean(0).norm()) > MAX_MEAN_DIRECTION
     if points is not None and one_sided:
-        found = find_overlap_centre(c2w, points)
-        centre = target if found is None else found
-    known = centre is not None
+        overlap = find_overlap_centre(c2w, points)
+        centre = target if overlap is None else overlap
+    has_depth = centre is not None
     if centre is None:
         centre = centres.mean(0) + FORWARD_DEPTH * centre_spread(c2w) * normalize(c2w[:, :3, 2].mean(0), dim=0)
-    return Region(layout, centre, float((centres - centre).norm(dim=1).median()), known)
+    return Region(layout, centre, float((centres - centre).norm(dim=1).median()), has_depth)
 
 
 def _make_surroundings_region(
     c2w: Float[Tensor, "V 4 4"], layout: CameraLayout, points: Float[Tensor, "P 3"] | None
 ) -> Region:
-    """What is around cameras that look at no one thing."""
+    """Region around cameras without a common subject."""
     centres, spread = c2w[:, :3, 3], centre_spread(c2w)
     depth = None if points is None else median_depth(c2w, points)
     if layout != CameraLayout.WALK:
@@ -118,16 +118,15 @@ def _make_surroundings_region(
 
 
 def find_overlap_centre(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> Float[Tensor, "3"] | None:
-    """The middle of the points that most photos look at, from the most different directions; None where none is looked at.
+    """Median of the points that are triangulated best; None if no camera looks at any.
 
-    A point's score is the sum over pairs of cameras of how well it is in view of both, times 1 - cos of the angle between
-    their directions to it: what is triangulated well.
+    A point's score is the sum over camera pairs of its visibility in both, times 1 - cos of its triangulation angle.
     """
-    some, c2w = points[:: -(-len(points) // MAX_POINTS)], c2w[:: -(-len(c2w) // MAX_VIEWS)]
-    seen = ((axis_cosines(c2w, some) - MIN_VIEW_COSINE) / (1 - MIN_VIEW_COSINE)).clamp_min(0)
-    toward = normalize(some[:, None] - c2w[:, :3, 3], dim=2)
-    score = seen.sum(1).square() - torch.einsum("pv,pvk->pk", seen, toward).square().sum(1)
+    points, c2w = points[:: -(-len(points) // MAX_POINTS)], c2w[:: -(-len(c2w) // MAX_VIEWS)]
+    visibility = ((axis_cosines(c2w, points) - MIN_VIEW_COSINE) / (1 - MIN_VIEW_COSINE)).clamp_min(0)
+    directions = normalize(points[:, None] - c2w[:, :3, 3], dim=2)
+    score = visibility.sum(1).square() - torch.einsum("pv,pvk->pk", visibility, directions).square().sum(1)
     best = score >= MIN_SCORE * score.quantile(0.95)
     if not bool((best & (score > 0)).any()):
         return None
-    return some[best].median(0).values
+    return points[best].median(0).values

@@ -1,4 +1,4 @@
-"""Opens a scene of any format: what is at the path decides how it is read."""
+"""Opens a scene, detecting its format from the files at the path."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import expand_user_path
 
 SUPPORTED_SOURCES = (
-    "photos or a video, an .npz file, a COLMAP folder (sparse/0), poses_bounds.npy beside images, a Blender folder"
+    "photos or a video, an .npz file, a COLMAP folder (sparse/0), poses_bounds.npy and images, a Blender folder"
     " (transforms_train.json), or transforms.json or its folder"
 )
 
@@ -29,18 +29,18 @@ def open_scene(
     near: float | None = None,
     far: float | None = None,
 ) -> Scene:
-    """Reads a scene of any supported format, told apart by what is inside.
+    """Reads a scene of any supported format, detected from its files.
 
     Args:
         path: an .npz file; a folder of a Blender scene (transforms_train.json), of a nerfstudio or instant-ngp capture
             (transforms.json, or that file), of LLFF (poses_bounds.npy), or of COLMAP (or its model's folder); else a folder
-            of photos, or a video, which COLMAP places once.
-        name: what to call it; defaults to the file's or folder's name.
-        near, far: distances along the rays, in the scene's unit, that override the bounds'.
-        options: see there.
+            of photos, or a video, which are reconstructed by COLMAP and cached.
+        name: scene name; defaults to the file's or folder's name.
+        near, far: distances along the rays, in the scene's unit, that override those of the bounds.
+        options: how to read photos.
 
     Raises:
-        InputError: nothing readable at `path`, or what is there is damaged.
+        InputError: nothing readable at `path`, or damaged files.
     """
     source = expand_user_path(path)
     try:
@@ -70,7 +70,7 @@ def _open(source: Path, name: str | None, options: PhotoLoadOptions) -> Scene:
     photos = None
     if source.suffix.lower() in VIDEOS and source.is_file():
         photos = extract_frames(source)
-    elif not any((source / below).is_dir() for below in MODEL_FOLDERS if below):  # a damaged model is not made again
+    elif not any((source / below).is_dir() for below in MODEL_FOLDERS if below):  # a damaged model is an error
         folders = (source / below for below in ("", *PHOTO_FOLDERS))
         photos = next((folder for folder in folders if folder.is_dir() and list_images(folder)), None)
     if photos is not None:

@@ -1,4 +1,4 @@
-"""Views: photos of any sizes, what is masked in them, and the cameras that took them."""
+"""Views: photos of any sizes with masks and cameras."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,21 +13,21 @@ from nerf_lightning.utils.tensor_dataclass import TensorDataclass
 
 @dataclass(frozen=True)
 class Views(TensorDataclass):
-    """Photos of any sizes, and the cameras that took them."""
+    """Photos of any sizes with masks and cameras, as one flat array of pixels."""
 
     pixels: UInt8[Tensor, "N C"]
-    """sRGB, photo after photo, each row by row; C is 3, or 4 with straight (not premultiplied) alpha."""
+    """sRGB, concatenated photos in row-major order; C is 3, or 4 with straight (not premultiplied) alpha."""
     cameras: Cameras
     valid_mask: Bool[Tensor, "N"] | None = None
-    """Pixels that count; None for all of them."""
+    """Unmasked pixels; None for all."""
     names: tuple[str, ...] = ()
-    """Of the photos' files; empty where they have none."""
+    """File names, or empty."""
     exposures: tuple[float, ...] = ()
-    """Light that each photo gathered, in any unit; empty unless all files state it."""
+    """Exposure of each photo, in any unit; empty unless all files state it."""
 
     @classmethod
     def from_images(cls, images: UInt8[Tensor, "V H W C"], cameras: Cameras) -> "Views":
-        """Photos of one size; no copy where they lie in memory one after the other."""
+        """Views of photos of one size; no copy if contiguous."""
         return cls(images.reshape(-1, images.shape[3]), cameras)
 
     def __len__(self) -> int:
@@ -40,19 +40,19 @@ class Views(TensorDataclass):
 
     @property
     def nbytes(self) -> int:
-        """Of the pictures and their masks."""
+        """Bytes of photos and masks."""
         return self.pixels.nbytes + (0 if self.valid_mask is None else self.valid_mask.nbytes)
 
     @cached_property
     def offsets(self) -> Int[Tensor, "V1"]:
-        """Where each photo begins in `pixels`, and where the last ends."""
+        """Start of each photo in `pixels`, and the end of the last."""
         return torch.cat([torch.zeros(1, dtype=torch.long), self.cameras.sizes.prod(1).cumsum(0)]).to(
             self.pixels.device
         )
 
     @cached_property
     def widths(self) -> Int[Tensor, "V"]:
-        """Of each photo, in pixels, where the pixels are."""
+        """Photo widths in pixels, on the device of `pixels`."""
         return self.cameras.sizes[:, 0].to(self.pixels.device)
 
     @cached_property
@@ -66,27 +66,27 @@ class Views(TensorDataclass):
         return self.pixels[start : start + width * height].view(height, width, -1)
 
     def name(self, view: int) -> str:
-        """Of a photo's file, or its number."""
+        """File name of a photo, or its index."""
         return self.names[view] if self.names else f"photo {view}"
 
     @property
     def images(self) -> UInt8[Tensor, "V H W C"]:
-        """All photos, where they have one size; no copy.
+        """All photos of one size, without a copy.
 
         Raises:
-            ValueError: they have several.
+            ValueError: the sizes differ.
         """
         return self.pixels.view(len(self), self.cameras.height, self.cameras.width, -1)
 
     @cached_property
     def mask(self) -> Bool[Tensor, "N"]:
-        """Which pixels count."""
+        """Unmasked pixels."""
         if self.valid_mask is not None:
             return self.valid_mask
         return torch.ones(len(self.pixels), dtype=torch.bool, device=self.pixels.device)
 
     def sample_pixels(self, count: int, generator: torch.Generator) -> Int[Tensor, "count"]:
-        """Places in `pixels`, drawn uniformly from those that count, with replacement."""
+        """Samples indices of unmasked pixels uniformly, with replacement."""
         device = self.pixels.device
         pixels = torch.randint(len(self.pixels), (count,), generator=generator, device=device)
         while self.valid_mask is not None and len(masked := (~self.valid_mask[pixels]).nonzero()[:, 0]):
@@ -94,13 +94,13 @@ class Views(TensorDataclass):
         return pixels
 
     def view_mask(self, view: int) -> Bool[Tensor, "H W"]:
-        """Which pixels of a photo count."""
+        """Unmasked pixels of one photo."""
         width, height = self.cameras.size(view)
         start = self._view_offsets[view]
         return self.mask[start : start + width * height].view(height, width)
 
     def __getitem__(self, index: Tensor) -> "Views":
-        """Some of the views; no copy of pixels where they follow each other."""
+        """Selects views; no copy of pixels for consecutive ones."""
         chosen = index.tolist()
         parts = [slice(self._view_offsets[view], self._view_offsets[view + 1]) for view in chosen]
         if chosen and chosen == list(range(chosen[0], chosen[0] + len(chosen))):
@@ -110,10 +110,10 @@ class Views(TensorDataclass):
             return values[parts[0]] if len(parts) == 1 else torch.cat([values[:0], *(values[part] for part in parts)])
 
         pixels = take(self.pixels)
-        known = None if self.valid_mask is None else take(self.valid_mask)
+        valid = None if self.valid_mask is None else take(self.valid_mask)
         names = tuple(self.names[view] for view in chosen) if self.names else ()
         exposures = tuple(self.exposures[view] for view in chosen) if self.exposures else ()
-        return Views(pixels, self.cameras[index], known, names, exposures)
+        return Views(pixels, self.cameras[index], valid, names, exposures)
 
     def subsample(self, count: int) -> "Views":
         """At most `count` views, evenly spaced from the first to the last."""

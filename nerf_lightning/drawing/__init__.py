@@ -1,1 +1,1 @@
-"""What all pictures share: colours, letters, panels, frames and spectra."""
+"""Drawing: panels, contact sheets, frames, charts and their style."""

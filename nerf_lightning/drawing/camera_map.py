@@ -1,4 +1,4 @@
-"""A map of a scene: the cameras, the tags, known points, and its box and orbit."""
+"""Camera map of a scene: cameras, tags, sparse points, box and orbit."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,19 +11,18 @@ from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.drawing.style import BLUE, DPI, GREY, ORANGE, VERMILLION
 
 FRUSTUM_FRACTION = 0.06
-"""Height of a camera's pyramid as a share of the map's width."""
+"""Height of a camera's frustum relative to the map's width."""
 FRUSTUM_STROKE = [0, 1, 2, 0, 3, 2, 3, 4, 0, 4, 1]
-"""Corners of a pyramid in an order that draws all of its edges."""
+"""Corners of a frustum in an order that draws all of its edges."""
 CENTRED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "annotation_clip": True}
 MAX_NUMBERED = 120
-"""Most cameras that are numbered; of more, every N-th is."""
+"""Most cameras with numbers; of more, every N-th."""
 MAX_POINTS = 5000
 MAX_WIDTH_INCHES, MAX_HEIGHT_INCHES = 13.0, 17.0
-"""Largest size of the map, inches."""
 
 
 def frustum_corners(K: Float[np.ndarray, "3 3"], width: int, height: int, depth: float) -> Float[np.ndarray, "5 3"]:
-    """A camera's centre and the picture's corners at a depth, in the camera's frame."""
+    """Camera centre and image corners at a depth, in the camera frame."""
     corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]], dtype=np.float64)
     return depth * np.concatenate([np.zeros((1, 3)), np.linalg.solve(K, corners.T).T])
 
@@ -34,22 +33,22 @@ def plot_camera_map(
     tags: dict[int, Float[np.ndarray, "M 3"]],
     unit: str = "in the scene's unit",
 ) -> Figure:
-    """A view from above, and one from the side below it, at the same scale.
+    """Plots the cameras of a scene from above and, below, from the side, at the same scale.
 
     Args:
         numbered: photos' numbers and poses, camera to world.
-        scene: made of them.
-        tags: corners in the world by id.
-        unit: of lengths, in words.
+        scene: the scene of these photos.
+        tags: world positions of corners, by tag id.
+        unit: unit of length, for the axes.
     """
     camera = scene.train.cameras[0].to_pinhole()
     orbit, box = scene.orbit.centres.double().numpy(), scene.bounds.aabb.double().numpy()
-    solid = np.concatenate([np.stack([c2w[:3, 3] for _, c2w in numbered]), orbit, box, *tags.values()])
-    depth = FRUSTUM_FRACTION * float(np.ptp(solid[:, :2], axis=0).max())
+    positions = np.concatenate([np.stack([c2w[:3, 3] for _, c2w in numbered]), orbit, box, *tags.values()])
+    depth = FRUSTUM_FRACTION * float(np.ptp(positions[:, :2], axis=0).max())
     shape = frustum_corners(camera.K[0].double().numpy(), *camera.size(0), depth)
     frusta = np.stack([shape @ c2w[:3, :3].T + c2w[:3, 3] for _, c2w in numbered])
-    everything = np.concatenate([solid, frusta.reshape(-1, 3)])
-    low, high = everything.min(0) - depth / 2, everything.max(0) + depth / 2
+    all_points = np.concatenate([positions, frusta.reshape(-1, 3)])
+    low, high = all_points.min(0) - depth / 2, all_points.max(0) + depth / 2
 
     span = high - low
     scale = min(MAX_WIDTH_INCHES / span[0], MAX_HEIGHT_INCHES / (span[1] + span[2]))
@@ -71,10 +70,10 @@ def plot_camera_map(
         closed = np.concatenate([orbit, orbit[:1]])
         axes.plot(closed[:, 0], closed[:, up], color=ORANGE, linewidth=2, label="orbit")
         if scene.points is not None:
-            some = scene.points[:: -(-len(scene.points) // MAX_POINTS)].numpy()
-            axes.plot(some[:, 0], some[:, up], ".", color="0.6", markersize=1.5, zorder=0.5, label="known points")
+            subset = scene.points[:: -(-len(scene.points) // MAX_POINTS)].numpy()
+            axes.plot(subset[:, 0], subset[:, up], ".", color="0.6", markersize=1.5, zorder=0.5, label="known points")
         for (number, _), points in list(zip(numbered, frusta, strict=True))[:: -(-len(frusta) // MAX_NUMBERED)]:
-            label_position = points[0] - 0.35 * (points[1:].mean(0) - points[0])  # where there are no lines
+            label_position = points[0] - 0.35 * (points[1:].mean(0) - points[0])  # behind the camera
             axes.annotate(str(number), label_position[[0, up]], fontsize=8, **CENTRED_TEXT)
     side.set_xlabel(f"x, {unit}")
     for tag, corners in tags.items():

@@ -1,4 +1,4 @@
-"""One frame: what a view shows, channel beside channel."""
+"""Channels of a rendered frame (rgb, depth, opacity), and error images."""
 
 from dataclasses import dataclass
 
@@ -17,25 +17,25 @@ from nerf_lightning.utils.text import subsample
 
 CHANNELS = ("rgb", "depth", "opacity")
 DEPTH_PROBE_VIEWS, DEPTH_PROBE_SIDE_PX = 6, 64
-"""Views, and pixels along their longer side, from which the range of depths is found."""
+"""Number of views, and their longest side, for measuring the range of depths."""
 BLACK = (0.0, 0.0, 0.0)
 ERROR_GAIN = 4
-"""By how much errors are magnified."""
+"""Magnification of error images."""
 
 
 @dataclass(frozen=True)
 class FrameStyle:
-    """How frames are drawn."""
+    """Channels, background and depth range of rendered frames."""
 
     channels: tuple[str, ...]
     background: tuple[float, float, float] | None
-    """What shows where nothing is, in [0, 1]; None leaves it transparent."""
+    """Colour in [0, 1]; None for a transparent background."""
     depth_range: tuple[float, float]
-    """What is bright and what is dark in a picture of depth, in the scene's unit: one range for a whole film."""
+    """Bright and dark end of the depth colormap, scene's unit: fixed for a whole video."""
 
 
 def measure_depth_range(system: NeRF3D, cameras: Cameras) -> tuple[float, float]:
-    """The 2nd and the 98th percentile of the depths that a few of the views show, in the scene's unit."""
+    """Renders a few views and returns the 2nd and 98th percentile of their depths, scene's unit."""
     small = cameras.rescale(min(1.0, DEPTH_PROBE_SIDE_PX / cameras.max_side))
     visible_depths = []
     for view in subsample(len(small), DEPTH_PROBE_VIEWS):
@@ -47,7 +47,7 @@ def measure_depth_range(system: NeRF3D, cameras: Cameras) -> tuple[float, float]
 def render_channels(
     system: NeRF3D, cameras: Cameras, view: int, style: FrameStyle
 ) -> dict[str, UInt8[ndarray, "H W C"]]:
-    """A view's channels; C is 4, with straight alpha, where the background is left transparent."""
+    """Renders the channels of a view; C is 4, with straight alpha, for a transparent background."""
     rays = cameras.generate_view_rays(view).to(system.device)
     rendered = system.render(rays, background=style.background or BLACK)
     width, height = cameras.size(view)
@@ -56,27 +56,27 @@ def render_channels(
 
 
 def render_channel(rendered: RenderOutput, channel: str, style: FrameStyle) -> Float[Tensor, "R C"]:
-    """What one channel shows along some rays, rendered on the style's background; black stands for a transparent one."""
+    """Colours of one channel, of rays rendered on the style's background (black for a transparent one)."""
     opacity = rendered.opacity[:, None]
     if channel == "opacity":
         grey = opacity.expand(-1, 3)
         return grey if style.background is not None else torch.cat([grey, torch.ones_like(opacity)], dim=1)
     if channel == "rgb":
-        covered = rendered.rgb  # on black: premultiplied
+        premultiplied = rendered.rgb  # rendered on black
     else:
-        painted = colorize_depth(rendered.depth.cpu().numpy(), *style.depth_range)
-        covered = torch.from_numpy(painted).to(opacity.device) / 255 * opacity
+        colors = colorize_depth(rendered.depth.cpu().numpy(), *style.depth_range)
+        premultiplied = torch.from_numpy(colors).to(opacity.device) / 255 * opacity
         if style.background is not None:
-            covered = covered + (1 - opacity) * torch.tensor(style.background, device=opacity.device)
+            premultiplied = premultiplied + (1 - opacity) * torch.tensor(style.background, device=opacity.device)
     if style.background is not None:
-        return covered
-    return torch.cat([covered / opacity.clamp_min(1e-6), opacity], dim=1)
+        return premultiplied
+    return torch.cat([premultiplied / opacity.clamp_min(1e-6), opacity], dim=1)
 
 
 def make_error_image(
     shown: UInt8[ndarray, "H W 3"], truth: UInt8[ndarray, "H W 3"]
 ) -> tuple[UInt8[ndarray, "H W 3"], float]:
-    """The difference, magnified, and the PSNR in dB of the two as bytes."""
+    """Magnified absolute difference, and the PSNR in dB of the two images."""
     difference = np.abs(shown.astype(np.float64) - truth)
     mse = float(np.mean((difference / 255) ** 2))
     return (ERROR_GAIN * difference).clip(0, 255).astype(np.uint8), mse_to_psnr(mse)

@@ -13,9 +13,8 @@ from PIL import Image, ImageDraw, ImageFont
 from nerf_lightning.drawing.style import FONT, VERMILLION, replace_missing_glyphs
 
 GAP_PX = 12
-"""Pixels between images."""
 LETTER_WIDTH_RATIO = 0.6
-"""Of `FONT`, as a share of its size, on average."""
+"""Mean letter width of `FONT` relative to its size."""
 
 
 def make_contact_sheet(
@@ -27,13 +26,13 @@ def make_contact_sheet(
     heading: str = "",
     text_px: int = 15,
 ) -> UInt8[ndarray, "H W 3"]:
-    """Lays out images row by row on white.
+    """Arranges images row by row on a white sheet.
 
     Args:
-        images: None leaves a grey box; none at all make a sheet of the heading alone.
-        captions: of each image, in as many lines as they need.
-        columns: images side by side, at most.
-        width: of the sheet in pixels, to which images are scaled; None keeps their own sizes.
+        images: None draws a grey box; an empty list gives the heading alone.
+        captions: one per image, wrapped to its width.
+        columns: most images side by side.
+        width: of the sheet in pixels, to which images are scaled; None keeps the images' sizes.
         flagged: indices of images to outline in vermillion.
         heading: above all images.
         text_px: size of the captions' letters; those of the heading are larger by half.
@@ -46,7 +45,8 @@ def make_contact_sheet(
     else:
         cell = (width - GAP_PX) // columns - GAP_PX
         box = round(cell * float(np.median([h / w for h, w in shapes])))
-    scaled = [np.full((box, cell, 3), 221, np.uint8) if one is None else fit_image(one, cell, box) for one in images]
+    missing = np.full((box, cell, 3), 221, np.uint8)
+    scaled = [missing if image is None else fit_image(image, cell, box) for image in images]
     texts = [wrap_text(caption, cell, text_px) for caption in captions]
     title = wrap_text(heading, width - 2 * GAP_PX, 3 * text_px // 2)
     line = round(1.3 * text_px)
@@ -72,7 +72,7 @@ def make_contact_sheet(
 
 
 def fit_image(image: UInt8[ndarray, "H W 3"], width: int, height: int) -> UInt8[ndarray, "h w 3"]:
-    """Scales an image to the largest size in a box: averaged where that is smaller, with hard edges where it is larger."""
+    """Scales an image to fit a box: area-averaged if smaller, nearest neighbour if larger."""
     rows, cols = image.shape[:2]
     scale = min(width / cols, height / rows)
     size = max(1, round(cols * scale)), max(1, round(rows * scale))
@@ -82,6 +82,6 @@ def fit_image(image: UInt8[ndarray, "H W 3"], width: int, height: int) -> UInt8[
 
 
 def wrap_text(text: str, width: int, text_px: int) -> list[str]:
-    """Lines of at most about `width` pixels; line ends in the text stay."""
+    """Wraps text to about `width` pixels; keeps its line breaks."""
     letters = max(1, int(width / (LETTER_WIDTH_RATIO * text_px)))
     return [line for part in text.splitlines() for line in textwrap.wrap(replace_missing_glyphs(part), letters)]

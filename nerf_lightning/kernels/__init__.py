@@ -1,6 +1,6 @@
-"""The hot loops: each file holds a plain PyTorch reference for every device, and picks between it and a fast version.
+"""Kernels: each file holds a PyTorch reference for every device and dispatches to the fast CPU version in `cpu/`.
 
-The fast versions for CPUs are in `cpu/`; `use_kernels("reference")` (config key `kernels`) switches them all off.
+`set_kernels("reference")` (config key `kernels`) disables all fast versions.
 """
 
 from nerf_lightning.kernels.backend import has_fast_kernel, set_kernels

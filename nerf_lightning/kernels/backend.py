@@ -1,4 +1,4 @@
-"""Which version of a kernel runs: the plain PyTorch reference, or the fast one for CPUs."""
+"""Kernel selection: the PyTorch reference or the fast CPU version."""
 
 import torch
 from torch import Tensor
@@ -9,10 +9,10 @@ _allowed = True
 
 
 def set_kernels(choice: str) -> None:
-    """Sets the version for this process: "auto" uses the fast one wherever it applies, "reference" never.
+    """Selects kernels for this process: "auto" uses fast versions where they apply, "reference" never.
 
     Raises:
-        InputError: on any other choice.
+        InputError: for any other choice.
     """
     global _allowed
     if choice not in ("auto", "reference"):
@@ -21,16 +21,16 @@ def set_kernels(choice: str) -> None:
 
 
 def get_kernels() -> str:
-    """The last choice given to `set_kernels`."""
+    """Current choice of `set_kernels`."""
     return "auto" if _allowed else "reference"
 
 
 def has_fast_kernel(*tensors: Tensor, constants: tuple[Tensor, ...] = ()) -> bool:
-    """Whether the fast version applies: it is allowed, and all floating tensors are single precision on a CPU.
+    """Whether the fast version applies: it is enabled, and all floating tensors are float32 on a CPU.
 
     Args:
         constants: further tensors, for which it has no gradient.
     """
-    given = (*tensors, *constants)
-    single = all(x.device.type == "cpu" and (x.dtype == torch.float32 or not x.is_floating_point()) for x in given)
-    return _allowed and single and not any(x.requires_grad for x in constants)
+    inputs = (*tensors, *constants)
+    is_fast = all(x.device.type == "cpu" and (x.dtype == torch.float32 or not x.is_floating_point()) for x in inputs)
+    return _allowed and is_fast and not any(x.requires_grad for x in constants)

@@ -1,4 +1,4 @@
-"""Constant tensors that kernels read: made once for each device, as each costs a copy to the device and a wait."""
+"""Cache of constant tensors, created once per device: each creation costs a host-device copy and sync."""
 
 import functools
 from collections.abc import Callable
@@ -9,17 +9,17 @@ import torch
 T = TypeVar("T")
 
 CACHED_FUNCTIONS: list[Callable[..., Any]] = []
-"""All functions whose results are cached."""
+"""Functions whose results are cached."""
 
 
 def cache_constants(make: Callable[..., T]) -> Callable[..., T]:
-    """Caches a function's results by its arguments. They work with gradients too, even if made in inference mode."""
+    """Decorator that caches results by arguments, and creates them outside inference mode so that autograd accepts them."""
 
     @functools.lru_cache(maxsize=64)
     @functools.wraps(make)
-    def made(*arguments: object) -> T:
+    def cached(*arguments: object) -> T:
         with torch.inference_mode(False):
             return make(*arguments)
 
-    CACHED_FUNCTIONS.append(made)
-    return made
+    CACHED_FUNCTIONS.append(cached)
+    return cached

@@ -1,4 +1,4 @@
-"""From samples to pixels: emission-absorption along rays (NeRF, eq. 3; Max 1995)."""
+"""Volume rendering: compositing of samples along rays (NeRF, eq. 3; Max 1995)."""
 
 import math
 
@@ -12,19 +12,17 @@ from nerf_lightning.kernels.march import Packed, first_true_indices, offsets_fro
 from nerf_lightning.kernels.segment_sums import exclusive_sum
 
 CompositedRays = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
-"""Colour, opacity and depth summed along each ray, each sample by its weight."""
+"""Weighted sums of colour, opacity and distance along each ray."""
 VisibleSamples = tuple[
     Float[Tensor, "K"], tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
 ]
-"""Optical thickness of the K of N samples that are kept, and what `Packed` says of them."""
+"""Optical depth of the K kept samples of N, and their `Packed` intervals."""
 
 
 def volume_weights(
     density: Float[Tensor, "N"], dt: Float[Tensor, "N"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
 ) -> Float[Tensor, "N"]:
-    """How much each sample contributes to its ray's pixel.
-
-    w_i = T_i (1 - exp(-sigma_i dt_i)),  T_i = exp(-sum_{j < i} sigma_j dt_j), the sum within the sample's ray.
+    """Rendering weights w_i = T_i (1 - exp(-sigma_i dt_i)) with transmittance T_i = exp(-sum_{j < i} sigma_j dt_j).
 
     Args:
         density: sigma, 1 / world unit, not negative.
@@ -33,10 +31,10 @@ def volume_weights(
         offsets: first sample of each ray, then N.
 
     Returns:
-        Weights in [0, 1]; over a ray they add up to its opacity.
+        Weights in [0, 1]; their sum over a ray is its opacity.
     """
-    thinner = -density * dt
-    return -torch.exp(exclusive_sum(thinner, ray, offsets)) * torch.expm1(thinner)
+    exponent = -density * dt
+    return -torch.exp(exclusive_sum(exponent, ray, offsets)) * torch.expm1(exponent)
 
 
 def composite_reference(
@@ -45,8 +43,8 @@ def composite_reference(
     """`composite` in plain PyTorch, for every device."""
     weights = volume_weights(density, dt, ray, offsets)
     values = torch.cat([rgb, torch.ones_like(weights)[:, None], t[:, None]], dim=1)
-    summed = values.new_zeros(len(offsets) - 1, 5).index_add(0, ray, weights[:, None] * values)
-    colour, opacity, distance = summed.split([3, 1, 1], dim=1)
+    sums = values.new_zeros(len(offsets) - 1, 5).index_add(0, ray, weights[:, None] * values)
+    colour, opacity, distance = sums.split([3, 1, 1], dim=1)
     return colour, opacity.squeeze(1), distance.squeeze(1)
 
 
@@ -54,12 +52,8 @@ class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, offsets: Tensor) -> CompositedRays:
         rays, density, rgb = len(offsets) - 1, density.contiguous(), rgb.T.contiguous()
-        colour, opacity, depth, transmittance = (
-            torch.empty(3, rays),
-            torch.empty(rays),
-            torch.empty(rays),
-            torch.empty(len(t)),
-        )
+        colour, opacity, depth = torch.empty(3, rays), torch.empty(rays), torch.empty(rays)
+        transmittance = torch.empty(len(t))
         cpu.composite.forward(density, rgb, t, dt, offsets, colour, opacity, depth, transmittance)
         ctx.save_for_backward(density, rgb, t, dt, offsets, transmittance)
         return colour.T, opacity, depth
@@ -79,7 +73,7 @@ def composite(
     ray: Int[Tensor, "N"],
     offsets: Int[Tensor, "R_plus_1"],
 ) -> CompositedRays:
-    """Sums colour, one, and distance over each ray, weighted as in `volume_weights`.
+    """Composites colour, opacity and distance along each ray by the weights of `volume_weights`.
 
     Args:
         density, dt, ray, offsets: see `volume_weights`.
@@ -104,22 +98,22 @@ def filter_visible_reference(
 ) -> VisibleSamples:
     """`filter_visible` in plain PyTorch, for every device."""
     t, dt, ray, offsets = packed
-    nothing = optical_depth < min_optical_depth  # NaN stays, so that somebody notices
+    transparent = optical_depth < min_optical_depth  # NaN stays and propagates
     if max_dropped < math.inf:
-        thin = torch.where(nothing, optical_depth, 0.0)
-        nothing &= exclusive_sum(thin, ray, offsets) + thin <= max_dropped
-    keep = ~((exclusive_sum(optical_depth, ray, offsets) > -math.log(early_stop_eps)) | nothing)
-    if capacity is not None:  # drops what an earlier call repeated to fill its room
+        thin = torch.where(transparent, optical_depth, 0.0)
+        transparent &= exclusive_sum(thin, ray, offsets) + thin <= max_dropped
+    keep = ~((exclusive_sum(optical_depth, ray, offsets) > -math.log(early_stop_eps)) | transparent)
+    if capacity is not None:  # drops the padding of an earlier call
         keep = keep & (dt > 0)
     counts = offsets_from_counts(keep)
     if capacity is None:
         index, kept = keep.nonzero()[:, 0], counts.index_select(0, offsets)
-        found, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
-        return found, (t, dt, ray, kept)
-    index, there = first_true_indices(capacity, counts)
-    kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # a ray may end beyond the room of the earlier call
-    found, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
-    return found * there, (t, dt * there, ray, kept)
+        depths, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
+        return depths, (t, dt, ray, kept)
+    index, is_real = first_true_indices(capacity, counts)
+    kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # a ray may end beyond the earlier call's capacity
+    depths, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
+    return depths * is_real, (t, dt * is_real, ray, kept)
 
 
 def filter_visible(
@@ -130,23 +124,22 @@ def filter_visible(
     capacity: int | None = None,
     max_dropped: float = math.inf,
 ) -> VisibleSamples:
-    """Drops samples that light cannot reach, and those that hold nothing.
+    """Drops occluded samples (transmittance below `early_stop_eps`) and transparent ones.
 
     Args:
         optical_depth: optical depth of each sample, density times length.
         packed: midpoints, lengths, rays and offsets of N samples.
-        early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
-        min_optical_depth: alpha threshold, as an optical depth: a sample below it holds nothing.
+        early_stop_eps: transmittance below which a ray ends, above 0.
+        min_optical_depth: optical depth below which a sample is transparent.
         capacity: see `march`.
-        max_dropped: optical depth that a ray's samples below `min_optical_depth` may have together; the later ones stay.
+        max_dropped: maximum total optical depth of a ray's dropped transparent samples; later ones stay.
     """
     t, dt, ray, offsets = packed
     if capacity is not None or not has_fast_kernel(optical_depth, constants=(t, dt)):
         return filter_visible_reference(optical_depth, packed, early_stop_eps, min_optical_depth, capacity, max_dropped)
     keep, counts = torch.empty(len(t), dtype=torch.bool), torch.empty(len(offsets) - 1, dtype=torch.int64)
-    cpu.composite.mark_visible(
-        optical_depth, offsets, early_stop_eps, float(min_optical_depth), max_dropped, keep, counts
-    )
+    limits = early_stop_eps, float(min_optical_depth), max_dropped
+    cpu.composite.mark_visible(optical_depth, offsets, *limits, keep, counts)
     kept = offsets_from_counts(counts)
     out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
     cpu.composite.pack_visible(keep, offsets, kept, optical_depth, t, dt, out, rays)

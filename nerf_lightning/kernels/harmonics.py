@@ -1,4 +1,4 @@
-"""Real spherical harmonics: the directions a colour network sees."""
+"""Real spherical harmonics, the directional encoding."""
 
 import torch
 from jaxtyping import Float
@@ -8,7 +8,7 @@ from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.backend import has_fast_kernel
 from nerf_lightning.kernels.cached_constants import cache_constants
 
-# Products of coordinates that the harmonics are made of: of two coordinates, then of three.
+# Monomials of degree 2 and 3 in the harmonics, as indices of their factors.
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
 TRIPLES = tuple((pair, axis) for pair in (0, 1, 2) for axis in (0, 1, 2)) + ((3, 2),)
 _XX, _YY, _ZZ, _XY, _YZ, _XZ = range(3, 9)
@@ -18,7 +18,7 @@ def _cubic(pair: int, axis: int) -> int:
     return 9 + TRIPLES.index((pair - 3, axis))
 
 
-# Each function as factors of those products; the first one is a constant.
+# Coefficients of the monomials in each function; the first function is constant.
 TERMS: tuple[dict[int, float], ...] = (
     {},
     {1: -0.48860251190291987},
@@ -42,7 +42,7 @@ CONSTANTS = {0: 0.28209479177387814, 6: -0.31539156525252005}
 
 @cache_constants
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Factors of all powers, constants, and which coordinates and pairs are multiplied."""
+    """Coefficients of all monomials, constants, and indices of the factors of pairs and triples."""
     factors = [[terms.get(power, 0.0) for terms in TERMS] for power in range(9 + len(TRIPLES))]
     constants = [CONSTANTS.get(function, 0.0) for function in range(len(TERMS))]
     firsts, seconds, pairs, axes = (list(column) for both in (PAIRS, TRIPLES) for column in zip(*both, strict=True))
@@ -56,8 +56,8 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, l
 
 def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
     """`spherical_harmonics` in plain PyTorch, for every device and precision, as one matrix product."""
-    factors, constants, (places, pair) = _tables(d.dtype, d.device)
-    first, second, axis = d.index_select(1, places).split([len(PAIRS), len(PAIRS), len(TRIPLES)], dim=1)
+    factors, constants, (coordinates, pair) = _tables(d.dtype, d.device)
+    first, second, axis = d.index_select(1, coordinates).split([len(PAIRS), len(PAIRS), len(TRIPLES)], dim=1)
     pairs = first * second
     triples = pairs.index_select(1, pair) * axis
     return torch.addmm(constants, torch.cat([d, pairs, triples], dim=1), factors)

@@ -1,4 +1,4 @@
-"""Where rays cross the occupied cells of a grid over the bounds."""
+"""Ray marching through an occupancy grid over the bounds."""
 
 import functools
 
@@ -13,24 +13,24 @@ from nerf_lightning.kernels.backend import has_fast_kernel
 from nerf_lightning.kernels.cached_constants import cache_constants
 
 INTERVALS_PER_CHUNK = 1 << 20
-"""Intervals that the reference tests at a time, unless told otherwise."""
+"""Default number of intervals that the reference tests at a time."""
 BLOCK = 4
-"""Cells along a side of a block; the fast version crosses an empty block in one leap."""
+"""Cells along a side of a block; the fast version skips empty blocks."""
 
 Packed = tuple[Float[Tensor, "N"], Float[Tensor, "N"], Int[Tensor, "N"], Int[Tensor, "R_plus_1"]]
-"""Midpoint and length of each interval, its ray, and where each ray's intervals begin."""
+"""Midpoints, lengths and rays of intervals, and the offset of each ray's first interval."""
 
 
 def cell_index(
     unit: Float[Tensor, "*batch 3"], resolution: int, kind: torch.dtype = torch.int64
 ) -> Int[Tensor, "*batch"]:
-    """Flat index of the cell of a resolution^3 grid over [0, 1]^3 that holds each position (clamped into the grid)."""
+    """Flat index of the cell of a resolution^3 grid over [0, 1]^3 at each position (clamped)."""
     x, y, z = (unit * resolution).to(kind).clamp_(0, resolution - 1).unbind(-1)
     return torch.add(z, torch.add(y, x, alpha=resolution), alpha=resolution)
 
 
 def offsets_from_counts(counts: Shaped[Tensor, "M"]) -> Int[Tensor, "M_plus_1"]:
-    """The sum of the counts before each one, and of all: of a mask, how many entries are true."""
+    """Exclusive cumulative sum of counts (or of a mask), with the total at the end."""
     return torch.cat([_zero(counts.device), counts.cumsum(0)])
 
 
@@ -48,9 +48,9 @@ def _counting_numbers(bits: int, device: torch.device) -> Int[Tensor, "numbers"]
 def first_true_indices(
     capacity: int, counts: Int[Tensor, "M_plus_1"]
 ) -> tuple[Int[Tensor, "capacity"], Bool[Tensor, "capacity"]]:
-    """Indices of the first `capacity` true entries, and which are real: the host need not wait for a count.
+    """Indices of the first `capacity` true entries, padded with the last one, and a mask of the real ones; no device sync.
 
-    Where fewer than `capacity` are true, the last one is repeated. `counts`: `offsets_from_counts` of the entries.
+    `counts`: `offsets_from_counts` of the entries.
     """
     order, total = _counting_numbers(capacity.bit_length(), counts.device)[:capacity], counts[-1:]
     return torch.searchsorted(counts[1:], torch.minimum(order, total)), order <= total
@@ -61,12 +61,12 @@ def _pack(
 ) -> Packed:
     steps, flat = keep.shape[1], keep.flatten()
     if capacity is None:
-        chosen, offsets = flat.nonzero()[:, 0], offsets_from_counts(keep.sum(1))
-        return t.flatten().index_select(0, chosen), dt.flatten().index_select(0, chosen), chosen // steps, offsets
+        indices, offsets = flat.nonzero()[:, 0], offsets_from_counts(keep.sum(1))
+        return t.flatten().index_select(0, indices), dt.flatten().index_select(0, indices), indices // steps, offsets
     counts = offsets_from_counts(flat)
-    chosen, there = first_true_indices(capacity, counts)
-    length = dt.flatten().index_select(0, chosen) * there
-    return t.flatten().index_select(0, chosen), length, chosen // steps, counts[::steps]
+    indices, is_real = first_true_indices(capacity, counts)
+    length = dt.flatten().index_select(0, indices) * is_real
+    return t.flatten().index_select(0, indices), length, indices // steps, counts[::steps]
 
 
 def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Packed:
@@ -81,7 +81,7 @@ def march_reference(
 ) -> Packed:  # fmt: skip
     """`march` in plain PyTorch, for every device."""
     resolution = round(len(occupied) ** (1 / 3))
-    # One more than `samples`: the shift may cut the first one short, and the last must reach the far end.
+    # One more than `samples`: the shift may shorten the first step, and the last must reach the far end.
     steps = torch.arange(-0.5, samples + 1, device=near.device) + shift[:, None]
     if bounds.unbounded:
         edges = bounds.s_to_t(rays, near, far, (steps / samples).clamp(0, 1))
@@ -92,8 +92,8 @@ def march_reference(
     rows = max(1, chunk // (samples + 1))
     for first in range(0, len(rays), rows):
         part = slice(first, first + rows)
-        places = (t[part, :, None] * rays.directions[part, None]).add_(rays.origins[part, None])
-        cells = cell_index(bounds.to_unit(places), resolution, torch.int32)  # half the time of int64
+        positions = (t[part, :, None] * rays.directions[part, None]).add_(rays.origins[part, None])
+        cells = cell_index(bounds.to_unit(positions), resolution, torch.int32)  # half the time of int64
         keep[part].logical_and_(occupied.index_select(0, cells.flatten()).view(cells.shape))
     return _pack(t, end - start, keep, capacity)
 
@@ -110,28 +110,27 @@ def march(
     capacity: int | None = None,
     chunk: int = INTERVALS_PER_CHUNK,
 ) -> Packed:
-    """Equal steps from near to far; keeps those whose midpoint lies in an occupied cell.
+    """Ray marching from near to far that keeps the steps with a midpoint in an occupied cell.
 
     Args:
         rays, bounds: in world units.
-        near, far: distances along each ray; a ray with near >= far gets nothing.
-        shift: moves each ray's steps along it, as a share of a step, in [0, 1).
+        near, far: distances along each ray; none where near >= far.
+        shift: jitter of each ray's steps, in steps, in [0, 1).
         occupied: cells of a cubic grid over the bounds' unit cube, last axis fastest.
-        samples: steps of an unbounded ray, spaced as `Bounds.s_to_t` says; at most this many (and one) inside bounds.
-        step: length of a step inside bounds.
-        capacity: how many entries to make whatever is found, so that the host waits for no count. If fewer are found, the
-            last interval is repeated with length 0; if more, rays whose `offsets` end beyond `capacity` lack some.
-        chunk: intervals that the reference tests at a time, which bounds its memory.
+        samples: steps of an unbounded ray, spaced by `Bounds.s_to_t`; inside bounds at most samples + 1.
+        step: step size inside bounds.
+        capacity: fixed output size, so that no host-device sync is needed. Shorter results are padded with intervals of
+            length 0; rays whose `offsets` end beyond it are truncated.
+        chunk: intervals that the reference tests at a time, to bound its memory.
     """
     if capacity is not None or not has_fast_kernel(constants=(rays.origins, rays.directions, near, far, shift)):
         return march_reference(rays, bounds, near, far, shift, occupied, samples, step, capacity, chunk)
-    return RayMarcher(rays, bounds, near, far, shift, occupied, samples, step).advance(
-        torch.arange(len(rays)), samples + 1
-    )
+    marcher = RayMarcher(rays, bounds, near, far, shift, occupied, samples, step)
+    return marcher.advance(torch.arange(len(rays)), samples + 1)
 
 
 class RayMarcher:
-    """The fast `march`, which may go some steps at a time. Arguments as there."""
+    """Fast `march` that can advance in increments; same arguments."""
 
     def __init__(
         self,
@@ -145,13 +144,13 @@ class RayMarcher:
         step: float,
     ):
         resolution = round(len(occupied) ** (1 / 3))
-        cells, held = resolution, occupied
+        cells, block_bits = resolution, occupied
         if resolution % BLOCK == 0:
             cells = resolution // BLOCK
-            # A block's four cells in a row as one number.
+            # Four cells in a row, read as one int32.
             rows = occupied.view(torch.int32).view(cells, BLOCK, cells, BLOCK, cells)
-            held = functools.reduce(torch.bitwise_or, [row for part in rows.unbind(1) for row in part.unbind(2)])
-        blocks = cpu.march.MAX_BLOCK_DISTANCE * (held == 0).to(torch.uint8).flatten()
+            block_bits = functools.reduce(torch.bitwise_or, [row for part in rows.unbind(1) for row in part.unbind(2)])
+        blocks = cpu.march.MAX_BLOCK_DISTANCE * (block_bits == 0).to(torch.uint8).flatten()
         if not bounds.unbounded:
             cpu.march.compute_block_distances(blocks.view(cells, cells, cells))
         inside = bounds.content_interval(rays) if bounds.unbounded else torch.empty(0, 2)
@@ -160,14 +159,12 @@ class RayMarcher:
         grid = occupied, resolution, blocks, cells
         self.arguments = rays.origins, rays.directions, *self.ray_limits, *grid, bounds.centre, *self.shape, *self.steps
         self.next_interval = torch.zeros(len(rays), dtype=torch.int32)
-        """The interval at which each ray goes on."""
+        """Interval at which each ray continues."""
 
     def advance(self, ray_indices: Int[Tensor, "A"], max_intervals: int) -> Packed:
-        """The next intervals of some rays, at most so many of each; `offsets` counts these rays alone."""
-        intervals, counts = (
-            torch.empty(len(ray_indices), max_intervals, dtype=torch.int32),
-            torch.empty_like(ray_indices),
-        )
+        """Next intervals of the rays with these indices, at most `max_intervals` each; `offsets` refers to these rays."""
+        intervals = torch.empty(len(ray_indices), max_intervals, dtype=torch.int32)
+        counts = torch.empty_like(ray_indices)
         cpu.march.march(ray_indices, *self.arguments, max_intervals, self.next_interval, intervals, counts)
         offsets = offsets_from_counts(counts)
         total = int(offsets[-1])
@@ -200,14 +197,14 @@ class _RayPositions(torch.autograd.Function):
 def ray_positions(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
 ) -> Float[Tensor, "N 3"]:
-    """Positions at distances `t` along rays; `ray` holds each position's ray."""
+    """Positions at distances `t` along the rays with indices `ray`."""
     if not has_fast_kernel(origins, directions, constants=(t,)):
         return ray_positions_reference(origins, directions, ray, t)
     return _RayPositions.apply(origins, directions, ray, t)
 
 
 def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions: Float[Tensor, "N 3"]) -> None:
-    """Writes `mark` into each cell of a cubic grid over the bounds that holds any of the positions (world units)."""
+    """Writes `mark` into the cells of a cubic grid over the bounds at world positions."""
     resolution = round(len(marks) ** (1 / 3))
     if has_fast_kernel(positions):
         cpu.march.mark_cells(positions.T, bounds.centre, bounds.half_size, bounds.unbounded, marks, resolution, mark)

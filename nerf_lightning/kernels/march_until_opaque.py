@@ -1,4 +1,4 @@
-"""Optical thickness along rays, asked of a field no farther than light reaches."""
+"""Front-to-back ray marching with early termination."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from nerf_lightning.kernels.backend import has_fast_kernel
 from nerf_lightning.kernels.march import Packed, RayMarcher, march, offsets_from_counts
 
 FIRST_STEPS_PER_RAY = 4
-"""Steps of each ray that are asked for at first; then four times as many each time."""
+"""Steps per ray in the first round; each round takes four times the steps of the one before."""
 
 
 def march_until_opaque(
@@ -30,28 +30,28 @@ def march_until_opaque(
     capacity: int | None = None,
     chunk: int = 1 << 20,
 ) -> tuple[Float[Tensor, "N"], Packed]:
-    """The intervals of `march`, and the optical thickness of each; the fast version may leave out what light cannot reach.
+    """Optical depths and intervals of `march`; the fast version may omit occluded ones.
 
     Args:
         rays, bounds, near, far, shift, occupied, samples, step, capacity, chunk: see `march`.
-        optical_depth: of given intervals.
-        early_stop_eps: early-stop transmittance, above 0: below it a ray has ended.
+        optical_depth: function that returns the optical depth of intervals.
+        early_stop_eps: transmittance below which a ray ends, above 0.
     """
-    given = rays, bounds, near, far, shift, occupied, samples, step
+    arguments = rays, bounds, near, far, shift, occupied, samples, step
     if capacity is not None or not has_fast_kernel(constants=(rays.origins, rays.directions, near, far, shift)):
-        packed = march(*given, capacity, chunk)
+        packed = march(*arguments, capacity, chunk)
         return optical_depth(packed), packed
-    marcher, furthest, many = RayMarcher(*given), -math.log(early_stop_eps), FIRST_STEPS_PER_RAY
-    going, counts = torch.arange(len(rays)), torch.zeros(len(rays), dtype=torch.int64)
+    marcher, max_depth, max_intervals = RayMarcher(*arguments), -math.log(early_stop_eps), FIRST_STEPS_PER_RAY
+    active, counts = torch.arange(len(rays)), torch.zeros(len(rays), dtype=torch.int64)
     optical, parts = torch.zeros(len(rays), dtype=torch.float64), []
-    while len(going):
-        packed = marcher.advance(going, many)
+    while len(active):
+        packed = marcher.advance(active, max_intervals)
         t, dt, _, ends = packed
-        found, on = optical_depth(packed), torch.empty(len(going), dtype=torch.bool)
-        cpu.composite.accumulate_optical_depth(found, ends, going, furthest, many, optical, on)
-        counts[going] += ends.diff()
-        parts.append((going, ends, found, t, dt))
-        going, many = going[on], 4 * many
+        depths, still_active = optical_depth(packed), torch.empty(len(active), dtype=torch.bool)
+        cpu.composite.accumulate_optical_depth(depths, ends, active, max_depth, max_intervals, optical, still_active)
+        counts[active] += ends.diff()
+        parts.append((active, ends, depths, t, dt))
+        active, max_intervals = active[still_active], 4 * max_intervals
     offsets = offsets_from_counts(counts)
     total, at = int(offsets[-1]), offsets[:-1].clone()
     out = torch.empty(total), torch.empty(total), torch.empty(total), torch.empty(total, dtype=torch.int64)

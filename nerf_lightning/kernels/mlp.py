@@ -1,4 +1,4 @@
-"""Small fully connected networks, run sample by sample rather than layer by layer."""
+"""Small fused multilayer perceptrons."""
 
 from collections.abc import Sequence
 
@@ -28,7 +28,7 @@ def _padded(width: int) -> int:
 
 
 def _blocks(shapes: list[tuple[int, int]], row: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Views of the layers' matrices and biases in a flat array where every width is padded to a multiple of 4."""
+    """Views of matrices and biases in a flat array with all widths padded to multiples of 4."""
     blocks, start = [], 0
     for outputs, inputs in shapes:
         o, i = _padded(outputs), _padded(inputs)
@@ -65,7 +65,7 @@ class _MLP(torch.autograd.Function):
 def mlp_heads(
     x: Float[Tensor, "N I"], layers: Layers, num_head: int, extra: Float[Tensor, "N E"] | None = None
 ) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:
-    """Like `mlp`, with the first outputs returned apart from the others, which saves splitting them."""
+    """`mlp` that returns the first `num_head` outputs and the rest separately, without a split."""
     parameters = [parameter for layer in layers for parameter in layer]
     if not has_fast_kernel(x, *parameters, *(() if extra is None else (extra,))):
         out = mlp_reference(x, layers, None if extra is None else extra.detach())
@@ -80,6 +80,6 @@ def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | N
     Args:
         x: inputs.
         layers: matrix [outputs, inputs] and bias of each layer.
-        extra: further inputs after `x`; they are constants and get no gradient.
+        extra: further inputs after `x`, without gradient.
     """
     return mlp_heads(x, layers, 0, extra)[1]

@@ -1,4 +1,4 @@
-"""Intervals along rays in warped distances, and how they move to where the weight is."""
+"""Inverse transform sampling of intervals along rays in warped distances s."""
 
 import numpy as np
 import torch
@@ -10,29 +10,29 @@ from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.backend import has_fast_kernel
 
 PDF_EPS = 1e-5
-"""Added to all weights: rays without any are divided evenly."""
+"""Added to all weights, so that rays without weight are divided evenly."""
 
 IntervalMidpoints = tuple[Float[Tensor, "N 3"], Float[Tensor, "R S"], Float[Tensor, "R S"]]
-"""Places of the midpoints in the unit cube, N = R S of them; their distances, and the intervals' lengths, world units."""
+"""Unit-cube positions of the N = R S midpoints, their distances and the intervals' lengths (world units)."""
 
 
 def interval_midpoints_reference(rays: Rays, bounds: Bounds, near: Tensor, far: Tensor, s: Tensor) -> IntervalMidpoints:
     """`interval_midpoints` in plain PyTorch, for every device."""
     edges = bounds.s_to_t(rays, near, far, s)
     t = (edges[:, :-1] + edges[:, 1:]) / 2
-    places = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).view(-1, 3)
-    return bounds.to_unit(places), t, edges[:, 1:] - edges[:, :-1]
+    positions = (rays.origins[:, None] + t[..., None] * rays.directions[:, None]).view(-1, 3)
+    return bounds.to_unit(positions), t, edges[:, 1:] - edges[:, :-1]
 
 
 def interval_midpoints(
     rays: Rays, bounds: Bounds, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]
 ) -> IntervalMidpoints:
-    """The middle and length of intervals.
+    """Midpoints and lengths of intervals.
 
     Args:
         rays, bounds: in world units.
         near, far: distances along each ray.
-        s: where the intervals begin and end, in [0, 1], see `Bounds.s_to_t`.
+        s: interval edges in [0, 1], see `Bounds.s_to_t`.
     """
     if not has_fast_kernel(constants=(rays.origins, rays.directions, near, far, s)):
         return interval_midpoints_reference(rays, bounds, near, far, s)
@@ -47,7 +47,7 @@ def interval_midpoints(
 def invert_cdf(
     edges: Float[Tensor, "R S_plus_1"], weights: Float[Tensor, "R S"], u: Float[Tensor, "R K"]
 ) -> Float[Tensor, "R K"]:
-    """Maps u in [0, 1] to distances distributed as the piecewise-constant density given by `weights` (NeRF, section 5.2)."""
+    """Maps u in [0, 1] by the inverse CDF of the piecewise-constant PDF given by `weights` (NeRF, section 5.2)."""
     pdf = weights + PDF_EPS
     cdf = torch.cumsum(pdf / pdf.sum(1, keepdim=True), dim=1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], dim=1)
@@ -61,12 +61,12 @@ def invert_cdf(
 def resample(
     s: Float[Tensor, "R S_plus_1"], pdf: Float[Tensor, "R S"], shift: Float[Tensor, "R"], count: int
 ) -> Float[Tensor, "R K_plus_1"]:
-    """Edges of `count` new intervals of equal share (NeRF, section 5.2: inverse transform sampling).
+    """Edges of `count` new intervals of equal probability (inverse transform sampling, NeRF, section 5.2).
 
     Args:
         s: edges of the old intervals, ascending.
-        pdf: of each old interval; about 1 in total.
-        shift: of each ray's edges, in shares of a new interval.
+        pdf: probability of each old interval; about 1 in total.
+        shift: shift of each ray's edges, in new intervals.
     """
     if not has_fast_kernel(s, pdf, shift):
         u = (torch.arange(count + 1, device=s.device) + shift[:, None]) / count

@@ -1,34 +1,34 @@
-"""Sums along rays that stay exact over many rays, even on devices without double precision."""
+"""Exclusive sums along rays, exact over many rays even without float64."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 DEVICES_WITHOUT_FLOAT64 = ("mps",)
-"""Device types without double precision."""
+"""Device types without float64."""
 COARSE_UNIT = 2.0**-8
-"""Unit of the coarse part of a value: 2^24 of them are exact in single precision."""
+"""Unit of the coarse part of a value: multiples up to 2^24 are exact in float32."""
 
 
 def exclusive_sum(
     values: Float[Tensor, "N *D"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
 ) -> Float[Tensor, "N *D"]:
-    """For each sample, the sum of the values before it on its ray.
+    """Sum of the preceding values on the ray, for each sample.
 
     Args:
-        values, ray: of each sample.
+        values, ray: value and ray of each sample.
         offsets: first sample of each ray, then N.
     """
     first = offsets.index_select(0, ray)
 
-    def along_ray(total: Tensor, own: Tensor) -> Tensor:
-        """From running sums over all rays, which outgrow single precision."""
-        less = total - own
-        return less - less.index_select(0, first)
+    def along_ray(total: Tensor, terms: Tensor) -> Tensor:
+        """Converts cumulative sums over all rays, which need more than float32."""
+        exclusive = total - terms
+        return exclusive - exclusive.index_select(0, first)
 
     if values.device.type not in DEVICES_WITHOUT_FLOAT64:
         return along_ray(values.cumsum(0, dtype=torch.float64), values).to(values.dtype)
-    # Sums of multiples of 2^-8 are exact up to 65536; the remainders are so small that their sums are nearly exact.
+    # Sums of multiples of 2^-8 are exact up to 65536; sums of the small remainders are nearly exact.
     coarse = (values.detach() / COARSE_UNIT).round() * COARSE_UNIT
     fine = values - coarse
     return along_ray(coarse.cumsum(0), coarse) + along_ray(fine.cumsum(0), fine)

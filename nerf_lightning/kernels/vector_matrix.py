@@ -1,4 +1,4 @@
-"""TensoRF: a volume as a sum of planes times lines (vector-matrix decomposition; Chen et al. 2022, eq. 3)."""
+"""Vector-matrix decomposition of volumes into planes times lines (TensoRF, Chen et al. 2022, eq. 3)."""
 
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ PLANE_AXES = ((1, 2), (0, 2), (0, 1))
 
 
 class GatherIndices(NamedTuple):
-    """What positions read: rows of all planes and lines, one mode after the other, and their weights."""
+    """Rows of all planes and lines to gather, mode by mode, and their interpolation weights."""
 
     plane_rows: Int[Tensor, "twelveN"]
     plane_weights: Float[Tensor, "4 N 3 1"]
@@ -26,7 +26,7 @@ class GatherIndices(NamedTuple):
 
 @cache_constants
 def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """The first axes of all planes, then the second ones; and the row offsets of modes, corners and ends."""
+    """First and second axes of all planes, and row offsets of modes, corners and line ends."""
     axes = torch.tensor(PLANE_AXES, device=device).T.flatten()
     mode, end = torch.arange(3, device=device), torch.arange(2, device=device)
     corner = (end[:, None] * side + end).flatten()
@@ -34,45 +34,44 @@ def _axes_and_steps(side: int, device: torch.device) -> tuple[Tensor, Tensor, Te
 
 
 def gather_indices(unit: Float[Tensor, "N 3"], side: int) -> GatherIndices:
-    """Where positions in [0, 1]^3 (clamped outside) read in planes and lines with `side` vertices along each axis."""
+    """Gather indices of positions (clamped to [0, 1]^3) in planes and lines with `side` vertices along each axis."""
     axes, plane_steps, line_steps = _axes_and_steps(side, unit.device)
     scaled = unit.clamp(0, 1) * (side - 1)
     low = scaled.long().clamp_(0, side - 2)
     fraction = scaled - low
-    share = torch.stack([1 - fraction, fraction])
-    (across, down), (row, column) = (x.index_select(-1, axes).split(3, dim=-1) for x in (share, low))
+    end_weights = torch.stack([1 - fraction, fraction])
+    (across, down), (row, column) = (x.index_select(-1, axes).split(3, dim=-1) for x in (end_weights, low))
     return GatherIndices(
         (torch.add(column, row, alpha=side) + plane_steps).flatten(),
         (across[:, None] * down).view(4, len(unit), 3, 1),
         (low + line_steps).flatten(),
-        share[..., None],
+        end_weights[..., None],
     )
 
 
 @cache_constants
 def _grid_sample_axes(device: torch.device) -> Int[Tensor, "3 2"]:
-    """`PLANE_AXES` as `grid_sample` wants them, the last one first."""
+    """`PLANE_AXES` in the order of `grid_sample`, last axis first."""
     return torch.tensor(PLANE_AXES, device=device).flip(1)
 
 
 def grid_sample_products(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N 3 C"]:
-    """`plane_line_products`, mode by mode, by PyTorch's own sampling of pictures: a fifth of the time of gathers on an NVIDIA
-    H200, where a gather gives each row of channels a block of threads. Apple's devices do not have its gradient."""
-    places = unit.clamp(0, 1).mul(2).sub(1).T
-    across = places[_grid_sample_axes(unit.device)].mT[:, None]
-    along = torch.stack([torch.zeros_like(places), places], dim=-1)[:, None]
+    """`plane_line_products` per mode by `grid_sample`: five times as fast as gathers on an NVIDIA H200; no gradient on MPS."""
+    coords = unit.clamp(0, 1).mul(2).sub(1).T
+    across = coords[_grid_sample_axes(unit.device)].mT[:, None]
+    along = torch.stack([torch.zeros_like(coords), coords], dim=-1)[:, None]
     corners = grid_sample(planes.permute(0, 3, 1, 2), across, padding_mode="border", align_corners=True)
     ends = grid_sample(lines.mT[..., None], along, padding_mode="border", align_corners=True)
-    unknown = 0 * places.sum(0)  # it clamps what is not a number, which is to show
-    return (corners * ends + unknown)[:, :, 0].permute(2, 0, 1)
+    nan = 0 * coords.sum(0)  # grid_sample hides NaN by clamping
+    return (corners * ends + nan)[:, :, 0].permute(2, 0, 1)
 
 
 def _products(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], at: GatherIndices
 ) -> Float[Tensor, "N 3 C"]:
-    """One gather for all planes and one for all lines: on a GPU the number of operations counts."""
+    """Products with one gather for all planes and one for all lines, as GPUs are launch-bound."""
     channels = lines.shape[2]
     corners = planes.flatten(0, 2).index_select(0, at.plane_rows).view(*at.plane_weights.shape[:3], channels)
     ends = lines.flatten(0, 1).index_select(0, at.line_rows).view(*at.line_weights.shape[:3], channels)
@@ -80,7 +79,7 @@ def _products(
 
 
 def _products_reference(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 3"]) -> list[Tensor]:
-    """Products of each of some planes and lines of one size, mode by mode, N 3 C, in plain PyTorch for every device."""
+    """Products [N, 3, C] of volumes of the same resolution, in plain PyTorch for every device."""
     if unit.device.type == "cuda":
         return [grid_sample_products(*volume, unit) for volume in volumes]
     at = gather_indices(unit, volumes[0][1].shape[1])
@@ -88,47 +87,46 @@ def _products_reference(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 
 
 
 def _block(channels: int) -> tuple[int, ...]:
-    """As long as a block of channels that one worker adds up together: enough to fill a register, few enough that every worker
-    gets some."""
+    """Tuple with the length of a worker's channel block: it fills a register and leaves blocks for every worker."""
     return (0,) * next(width for width in (8, 4, 2, 1) if channels % width == 0)
 
 
 class _PlaneLine(torch.autograd.Function):
     @staticmethod
     def forward(ctx, planes: Tensor, lines: Tensor, unit: Tensor, summed: bool) -> Tensor:
-        planes, lines, places, channels = planes.contiguous(), lines.contiguous(), unit.T.contiguous(), lines.shape[2]
+        planes, lines, coords, channels = planes.contiguous(), lines.contiguous(), unit.T.contiguous(), lines.shape[2]
         out = torch.empty(1 if summed else 3 * channels, len(unit))
-        given, lanes = (planes.flatten(1, 2), lines, places, out), (0,) * channels
+        arguments, lanes = (planes.flatten(1, 2), lines, coords, out), (0,) * channels
         if summed:
-            cpu.vector_matrix.sums(*given, lanes)
+            cpu.vector_matrix.sums(*arguments, lanes)
         else:
-            cpu.vector_matrix.products(*given, lanes, _block(channels))
-        ctx.save_for_backward(planes, lines, places)
+            cpu.vector_matrix.products(*arguments, lanes, _block(channels))
+        ctx.save_for_backward(planes, lines, coords)
         return out.T
 
     @staticmethod
     def backward(ctx, grad: Tensor) -> tuple[Tensor, Tensor, Tensor | None, None]:
-        planes, lines, places = ctx.saved_tensors
+        planes, lines, coords = ctx.saved_tensors
         grad_planes, grad_lines = torch.zeros_like(planes), torch.zeros_like(lines)
-        given, block = (planes.flatten(1, 2), lines, places, grad.T.contiguous()), _block(lines.shape[2])
-        cpu.vector_matrix.scatter(*given, grad_planes.flatten(1, 2), grad_lines, block, 2 * block)
-        moved = None
+        arguments, block = (planes.flatten(1, 2), lines, coords, grad.T.contiguous()), _block(lines.shape[2])
+        cpu.vector_matrix.scatter(*arguments, grad_planes.flatten(1, 2), grad_lines, block, 2 * block)
+        grad_unit = None
         if ctx.needs_input_grad[2]:
-            moved = torch.empty_like(places)
-            cpu.vector_matrix.position_gradient(*given, moved, (0,) * lines.shape[2], block)
-            moved = moved.T
-        return grad_planes, grad_lines, moved, None
+            grad_unit = torch.empty_like(coords)
+            cpu.vector_matrix.position_gradient(*arguments, grad_unit, (0,) * lines.shape[2], block)
+            grad_unit = grad_unit.T
+        return grad_planes, grad_lines, grad_unit, None
 
 
 def plane_line_products(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N threeC"]:
-    """Each plane's channels, interpolated bilinearly, times those of the line across it, interpolated linearly.
+    """Products of each plane's channels (bilinear interpolation) and its line's channels (linear).
 
     Args:
-        planes: over the axes (1, 2), (0, 2) and (0, 1); S >= 2 vertices from 0 to 1, both included.
-        lines: along the axes 0, 1 and 2.
-        unit: positions in [0, 1]^3; outside they are clamped.
+        planes: planes of the axes (1, 2), (0, 2) and (0, 1); S >= 2 vertices from 0 to 1 inclusive.
+        lines: lines along the axes 0, 1 and 2.
+        unit: positions, clamped to [0, 1]^3.
     """
     if has_fast_kernel(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, False)
@@ -138,7 +136,7 @@ def plane_line_products(
 def plane_line_sum(
     planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
 ) -> Float[Tensor, "N"]:
-    """The sum of what `plane_line_products` gives at each position."""
+    """Sum of `plane_line_products` at each position."""
     if has_fast_kernel(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, True)[:, 0]
     return _products_reference((planes, lines), unit=unit)[0].sum((1, 2))
@@ -149,7 +147,7 @@ def plane_line_sum_and_products(
     separate: tuple[Float[Tensor, "3 S S B"], Float[Tensor, "3 S B"]],
     unit: Float[Tensor, "N 3"],
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N threeB"]]:
-    """`plane_line_sum` of some planes and lines, and `plane_line_products` of others of the same size."""
+    """`plane_line_sum` of one volume and `plane_line_products` of another of the same resolution."""
     if has_fast_kernel(*summed, unit) and has_fast_kernel(*separate, unit):
         return plane_line_sum(*summed, unit), plane_line_products(*separate, unit)
     total, products = _products_reference(summed, separate, unit=unit)

@@ -1,4 +1,4 @@
-"""What every field offers, in three dimensions and in two."""
+"""Base classes of radiance fields and of picture fields."""
 
 import math
 from typing import Any, Literal, NamedTuple
@@ -11,50 +11,47 @@ from nerf_lightning.cameras import BoundedModule, Bounds
 from nerf_lightning.model.growth import ResolutionSchedule
 
 BYTES_PER_PARAMETER = 16
-"""In training: itself, its gradient and Adam's two moments, in single precision."""
+"""Training memory: parameter, gradient and Adam's two moments, in single precision."""
 MAX_CELLS_PER_PIXEL = 2.0
-"""Along a side: many views together show more than one does, but finer cells hold noise."""
+"""Grid cells per pixel along a side: many views resolve more than one view does, but finer cells fit noise."""
 Size = Literal["auto", "fixed"]
 
 
 class FieldOutput(NamedTuple):
-    """What a radiance field says of positions seen from directions."""
+    """Output of a radiance field for N positions and viewing directions."""
 
     density: Float[Tensor, "N"]
     """1 / world unit, not negative."""
     rgb: Float[Tensor, "N 3"]
     """In [0, 1]."""
     view_residual: Float[Tensor, "N 3"] | None = None
-    """What the direction adds to the logits of the colour (SNeRG, Hedman et al. 2021); None where the field cannot tell."""
+    """View-dependent part of the colour logits (SNeRG, Hedman et al. 2021); None if the field does not separate it."""
 
 
 class BaseField(torch.nn.Module):
-    """What fields in two and in three dimensions have in common."""
+    """Interface shared by radiance fields and picture fields."""
 
     max_lr: float = math.inf
-    """Adam's learning rate above which training diverges, as the stability suite measured it; infinite if unknown."""
+    """Maximum stable learning rate of Adam, measured by the stability suite; infinite if unknown."""
     growth: ResolutionSchedule | None = None
-    """Of a field that is upsampled during training."""
+    """Upsampling schedule; None for a field of constant resolution."""
     size_message: str = ""
-    """One line on how the field's size follows from the data; "" if it does not."""
+    """Log line that explains how the data limit the field's size; "" if they do not."""
 
     def max_num_parameters(self) -> int:
-        """How many numbers it will learn at its full size, as far as that is known beforehand."""
+        """Number of parameters at the final resolution, as far as it is known in advance."""
         return sum(parameter.numel() for parameter in self.parameters())
 
     @property
     def training_bytes(self) -> int:
-        """Memory that it takes in training at least, at its largest."""
+        """Minimum training memory at the final resolution."""
         return BYTES_PER_PARAMETER * self.max_num_parameters()
 
     def warm_start_from(self, smaller: Any) -> None:
-        """Copies the function of a smaller field of the same kind, as far as possible, leaving the rest free to learn.
-
-        What cannot be copied starts fresh; here, that is everything.
-        """
+        """Copies the function of a smaller field of the same kind; what cannot be copied keeps its random initialization."""
 
     def export_state(self) -> dict[str, Tensor]:
-        """The least that rendering needs, for `import_state`."""
+        """State that rendering needs, for `import_state`."""
         return dict(self.state_dict())
 
     def import_state(self, state: dict[str, Tensor]) -> None:
@@ -69,17 +66,16 @@ class BaseField(torch.nn.Module):
 class Field(BoundedModule, BaseField):
     """A radiance field in world coordinates. Subclasses define `features` and `colour`, or `density` and `forward`.
 
-    Networks work in units of the bounds' half-size; `forward` and `density` convert to 1 / world unit, so that a scene in
-    metres and the same scene in millimetres train alike. A field that grows has a `growth` and defines `stage` and `upsample`.
+    Networks work in units of the bounds' half-size; `forward` and `density` convert to 1 / world unit, so that training does
+    not depend on the scene's unit of length. A field with a `growth` schedule defines `stage` and `upsample`.
     """
 
     stage: int = 0
-    """Of `growth`."""
+    """Current stage of `growth`."""
 
     @property
     def resolution_scale(self) -> float:
-        """How much finer than usual large photos have made it by now: it wants so many more steps along a ray, and samples a
-        step."""
+        """Current resolution relative to the default; the samplers' steps and the batch size scale with it."""
         return 1.0
 
     def __init__(self, bounds: Bounds):
@@ -87,19 +83,19 @@ class Field(BoundedModule, BaseField):
         self.unit_length = bounds.max_half_size
 
     def limit_resolutions(self, base_resolution: int, max_resolution: int, size: Size) -> tuple[int, int]:
-        """Cells along a side of the coarsest and the finest grid: as given, or with "auto" no more than the photos can show."""
-        across = self.bounds.unit_cube_pixels
-        if size == "fixed" or across == math.inf:
+        """Returns both resolutions, with "auto" limited to `MAX_CELLS_PER_PIXEL` of the photos."""
+        pixels = self.bounds.unit_cube_pixels
+        if size == "fixed" or pixels == math.inf:
             return base_resolution, max_resolution
-        shown = max(math.ceil(MAX_CELLS_PER_PIXEL * across), 2)
+        max_cells = max(math.ceil(MAX_CELLS_PER_PIXEL * pixels), 2)
         self.size_message = (
-            f"the content is {across:.0f} pixels wide in the photos, which show {shown} cells a side at most:"
-            f" {min(max_resolution, shown)} of {max_resolution} wanted"
+            f"the content is {pixels:.0f} pixels wide in the photos, which show {max_cells} cells a side at most:"
+            f" {min(max_resolution, max_cells)} of {max_resolution} wanted"
         )
-        return min(base_resolution, shown), min(max_resolution, shown)
+        return min(base_resolution, max_cells), min(max_resolution, max_cells)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        """World positions -> density (1 / half-size, not negative) and what `colour` needs."""
+        """World positions -> density (1 / half-size, not negative) and the features that `colour` reads."""
         raise TypeError(f"{type(self).__name__} must define features(positions)")
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
@@ -107,19 +103,19 @@ class Field(BoundedModule, BaseField):
         raise TypeError(f"{type(self).__name__} must define colour(features, directions)")
 
     def upsample(self, stage: int) -> list[torch.nn.Parameter]:
-        """Takes the resolution of a later stage of its `growth`; the function stays the same as far as it can.
+        """Upsamples to the resolution of a later stage of `growth`, preserving the function as far as possible.
 
         Returns:
-            Parameters whose data now has another shape: an optimiser must forget its state for them.
+            Parameters whose shape changed: the optimiser's state for them must be reset.
         """
         raise TypeError(f"{type(self).__name__} must define upsample(stage)")
 
     def losses(self) -> dict[str, Float[Tensor, ""]]:
-        """Regularization losses on what the field holds, by name."""
+        """Regularization losses on the parameters, by name."""
         return {}
 
-    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
-        """Empties what no position in the reached cells of the unit cube reads; in those cells the field does not change."""
+    def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
+        """Clears parameters that no position in the visible cells of the unit cube reads; the field there is unchanged."""
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """World positions -> density, 1 / world unit."""
@@ -135,8 +131,8 @@ class PictureField(BaseField):
     """A picture as a function of position: subclasses define `forward`.
 
     Args:
-        size: width and height of the picture in pixels, which decide how fine the field is.
-        lr_scale: factor on the learning rate, above 0, so that one rate suits every kind of field.
+        size: width and height of the picture in pixels, which determine the field's resolution.
+        lr_scale: factor on the learning rate, above 0, so that one configured rate works for all fields.
     """
 
     def __init__(self, size: tuple[int, int], lr_scale: float = 1.0):
@@ -146,7 +142,7 @@ class PictureField(BaseField):
 
     @property
     def nyquist(self) -> float:
-        """The Nyquist frequency of the pixels, in cycles over the picture's longer side."""
+        """Nyquist frequency of the pixels, in cycles over the picture's longer side."""
         return max(self.size) / 2
 
     def centred(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:

@@ -1,4 +1,4 @@
-"""When a grid is upsampled during training, and its parameters of another shape."""
+"""Coarse-to-fine schedule of grid resolutions, and replacement of parameters by others of another shape."""
 
 import math
 from collections.abc import Sequence
@@ -10,13 +10,13 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ResolutionSchedule:
-    """The stages of a field that is upsampled during training, as fractions of it.
+    """Resolution stages of a field that is upsampled during training.
 
     Args:
         resolutions: cells along a side, one for each stage.
-        starts: share of the training at which each stage begins; the first is 0.
-        min_steps: steps before which the last stage does not begin, whatever the budget: earlier ones need them.
-        max_steps: steps after which it begins, whatever the budget: earlier ones have learned what they can by then.
+        starts: training progress in [0, 1] at which each stage begins; the first is 0.
+        min_steps: minimum number of steps before the last stage, whatever the budget.
+        max_steps: maximum number of steps before the last stage, whatever the budget: coarse stages converge by then.
     """
 
     resolutions: Sequence[int]
@@ -26,20 +26,20 @@ class ResolutionSchedule:
 
     @property
     def end(self) -> float:
-        """Share of the training at which the last stage begins."""
+        """Training progress at which the last stage begins."""
         return self.starts[-1]
 
     def stage_at(self, progress: float) -> int:
-        """The stage after this share of the training."""
+        """Stage at this training progress."""
         return max(stage for stage, start in enumerate(self.starts) if progress >= start)
 
     def clamp_progress(self, progress: float, step: int, allow_shortening: bool = True) -> float:
-        """The share of the training to take the stage of, after `step` steps of which only few or many fitted into it.
+        """Growth progress in [0, 1]: `progress`, delayed by `min_steps` and advanced by `max_steps`.
 
         Args:
-            progress: share of the training done.
+            progress: training progress in [0, 1].
             step: steps done.
-            may_hurry: whether `max_steps` counts.
+            allow_shortening: whether `max_steps` applies.
         """
         if allow_shortening:
             progress = max(progress, self.end * min(1.0, step / self.max_steps))
@@ -47,8 +47,8 @@ class ResolutionSchedule:
 
 
 def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
-    """Gives a parameter data of another shape. Modules and optimisers keep the same parameter."""
+    """Replaces a parameter's data by a tensor of another shape; modules and optimisers keep the parameter object."""
     parameter.grad = None
-    # Autograd remembers a parameter's shape while a graph that used it lives; a change of type makes it forget.
+    # Autograd caches the parameter's shape while a graph uses it; assigning a tensor of another dtype first clears it.
     parameter.data = data.new_empty(0, dtype=torch.float16)
     parameter.data = data

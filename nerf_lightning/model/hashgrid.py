@@ -1,4 +1,4 @@
-"""Multiresolution hash grid (Instant-NGP, Müller et al. 2022) and the field that reads from it."""
+"""Multiresolution hash grid (Instant-NGP, Müller et al. 2022) and the radiance field on it."""
 
 from collections.abc import Sequence
 
@@ -19,29 +19,25 @@ from nerf_lightning.utils.option_checks import Count, GridSize, Layers, Log2Size
 
 
 def level_resolutions(num_levels: int, base_resolution: int, max_resolution: int) -> list[int]:
-    """Cells along each side of every level, growing geometrically from base to maximum resolution (Instant-NGP, eq. 2 and 3).
+    """Cells along a side of every level, geometric from base to maximum resolution (Instant-NGP, eq. 2 and 3).
 
     Raises:
         InputError: where base_resolution > max_resolution.
     """
     if base_resolution > max_resolution:
-        raise InputError(
-            "model.base_resolution",
-            "",
-            f"{base_resolution} with model.max_resolution={max_resolution}",
-            "0 < base_resolution <= max_resolution",
-        )
+        problem = f"{base_resolution} with model.max_resolution={max_resolution}"
+        raise InputError("model.base_resolution", "", problem, "0 < base_resolution <= max_resolution")
     growth = (max_resolution / base_resolution) ** (1 / max(num_levels - 1, 1))
     return [round(base_resolution * growth**level) for level in range(num_levels)]
 
 
 def cubic_cells(num_levels: int, base_resolution: int, max_resolution: int) -> list[GridCells]:
-    """Cells along each axis of every level of a grid of cubes, see `level_resolutions`."""
+    """Cells along each axis of every level of a cubic grid, see `level_resolutions`."""
     return [(side,) * 3 for side in level_resolutions(num_levels, base_resolution, max_resolution)]
 
 
 def table_sizes(cells: Sequence[GridCells], entries: int) -> list[int]:
-    """Entries of each level's table: all corners of its grid where they fit."""
+    """Entries of each level's table: one per vertex, at most `entries`."""
     return [min(corner_count(level), entries) for level in cells]
 
 
@@ -49,9 +45,9 @@ class HashGrid(torch.nn.Module):
     """Trainable features on nested grids over the unit square or cube.
 
     Args:
-        cells: of each grid along each axis.
-        log2_hashmap_size: each level has at most 2^log2_hashmap_size entries; levels too fine for that share them by hashing.
-        features_per_level: numbers per entry.
+        cells: cells of each level along each axis.
+        log2_hashmap_size: log2 of a level's maximum number of entries; finer levels are hashed.
+        features_per_level: features per entry.
     """
 
     def __init__(self, cells: Sequence[GridCells], log2_hashmap_size: int, features_per_level: int):
@@ -65,41 +61,41 @@ class HashGrid(torch.nn.Module):
         return hash_interpolate(self.tables, unit, self.cells, self.sizes)
 
     def rows(self, vertices: Int[Tensor, "D N"], level: int) -> Int[Tensor, "N"]:
-        """Rows of `tables` that hold a level's vertices."""
+        """Rows of `tables` for vertices of a level."""
         return sum(self.sizes[:level]) + entry_index(vertices, self.cells[level], self.sizes[level])
 
     @torch.no_grad()
     def warm_start_from(self, smaller: "HashGrid") -> Int[Tensor, "I"] | None:
-        """Copies the levels of another grid; this one's tables are as large or larger.
+        """Copies the levels of another grid whose tables are not larger.
 
         Returns:
-            For each feature of the smaller grid, its place among this grid's; None, and nothing is copied, without all levels.
+            Index among this grid's features of each feature of the smaller grid; None (nothing copied) if a level is missing.
         """
         features = self.tables.shape[1]
         if features != smaller.tables.shape[1] or any(cells not in self.cells for cells in smaller.cells):
             return None
         matches = [self.cells.index(cells) for cells in smaller.cells]
-        for its, mine in enumerate(matches):
-            cells, size = self.cells[mine], self.sizes[mine]
+        for theirs, ours in enumerate(matches):
+            cells, size = self.cells[ours], self.sizes[ours]
             if size == corner_count(cells):
                 vertices = torch.cartesian_prod(*(torch.arange(side + 1, dtype=torch.int32) for side in cells)).T
-                self.tables[self.rows(vertices, mine)] = smaller.tables[smaller.rows(vertices, its)]
-            else:  # hashes differ only in how many of their bits are used
-                entries = sum(smaller.sizes[:its]) + torch.arange(size) % smaller.sizes[its]
-                self.tables[sum(self.sizes[:mine]) + torch.arange(size)] = smaller.tables[entries]
+                self.tables[self.rows(vertices, ours)] = smaller.tables[smaller.rows(vertices, theirs)]
+            else:  # the hashes differ only in the number of bits used
+                entries = sum(smaller.sizes[:theirs]) + torch.arange(size) % smaller.sizes[theirs]
+                self.tables[sum(self.sizes[:ours]) + torch.arange(size)] = smaller.tables[entries]
         return (features * torch.tensor(matches)[:, None] + torch.arange(features)).flatten()
 
     @torch.no_grad()
-    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
-        """Zeroes the entries that no position in the reached cells reads."""
-        read = torch.zeros(len(self.tables), dtype=torch.bool, device=find_visible_cells.device)
+    def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
+        """Zeroes the entries that no position in the visible cells reads."""
+        read = torch.zeros(len(self.tables), dtype=torch.bool, device=visible_cells.device)
         for level, (side, *_) in enumerate(self.cells):
-            read[self.rows(vertices_of_cells(find_visible_cells, side).nonzero().T.int(), level)] = True
+            read[self.rows(vertices_of_cells(visible_cells, side).nonzero().T.int(), level)] = True
         self.tables[~read] = 0
 
 
 class HashGridField(Field):
-    """Hash-grid features, a small density network, and a small colour network that also sees the direction.
+    """Hash-grid features, a small density network, and a small view-dependent colour network (Instant-NGP).
 
     Args:
         bounds: the box the grid covers.
@@ -108,16 +104,16 @@ class HashGridField(Field):
         base_resolution, max_resolution: cells along a side of the first and the last grid.
         width: neurons of the hidden layers (one for density, two for colour).
         degree: see `TensoRFField`.
-        view_residual: whether a place has a colour of its own, to which the colour network adds what the direction changes
-            (as in SNeRG, Hedman et al. 2021); otherwise the network makes all of the colour.
+        view_residual: predict a diffuse colour from the position and add a view-dependent residual (SNeRG, Hedman et al.
+            2021); otherwise one view-dependent colour.
         density: "relu", "softplus" or "exp".
-        size: "auto" lowers both resolutions to what the photos can show; "fixed" takes them as they are.
+        size: "auto" limits both resolutions to what the photos resolve; "fixed" does not.
 
     Raises:
         InputError: where base_resolution > max_resolution.
     """
 
-    GEOMETRY_FEATURES = 15  # features handed from density to colour network, Instant-NGP section 5.4
+    GEOMETRY_FEATURES = 15  # passed from the density to the colour network, Instant-NGP section 5.4
     INIT_LOG_DENSITY = -1.0  # an exponential density starts as thin fog
     max_lr = 0.1
 
@@ -148,20 +144,20 @@ class HashGridField(Field):
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """The layers drew their own. Starting from dense fog, training may remove all density, and all gradient with it."""
+        """Lowers the density bias: starting from dense fog, training may collapse to zero density and zero gradient."""
         if self.has_exp_density:
             self.density_net[-1].get_parameter("bias")[0] = self.INIT_LOG_DENSITY
 
     def warm_start_from(self, smaller: Field) -> None:
-        """Copies a field that has no other levels, and makes colours alike."""
+        """Copies a field with the same `view_residual` whose levels are all among this one's."""
         assert isinstance(smaller, HashGridField)
         if self.view_residual != smaller.view_residual or (columns := self.grid.warm_start_from(smaller.grid)) is None:
             return
         widen(linear_layers(self.density_net), linear_layers(smaller.density_net), columns)
         widen(linear_layers(self.colour_net), linear_layers(smaller.colour_net))
 
-    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
-        self.grid.prune(find_visible_cells)
+    def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
+        self.grid.prune(visible_cells)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         encoded = self.grid(self.bounds.to_unit(positions))

@@ -1,4 +1,4 @@
-"""A picture as features on nested hash grids and one small network (Instant-NGP, Müller et al. 2022, section 5.1)."""
+"""Multiresolution hash grid and small network for a picture (Instant-NGP, Müller et al. 2022, section 5.1)."""
 
 import math
 from typing import Annotated
@@ -14,25 +14,22 @@ from nerf_lightning.model.layers.networks import build_layers, layer_parameters,
 from nerf_lightning.utils.option_checks import Count, Ge, GridSize, Layers, Le, PositiveFloat
 
 PER_LEVEL_SCALE = 2.4
-"""How much finer each level is than the one before, unless their number is given."""
+"""Growth factor between levels, unless their number is given."""
 
 
 class HashGrid2DField(PictureField):
-    """Hash-grid features of a position, and a network that turns them into a colour.
-
-    The finest level has a vertex at the centre of every pixel: the picture could not fill a finer one.
+    """Hash-grid features of a position and a colour network. The finest level has a vertex at every pixel centre.
 
     Args:
         size: see `PictureField`.
-        num_levels: number of grids; fewer for a picture where some would be equal. None: each is about 2.4 times finer than
-            the one before.
-        log2_hashmap_size: each level has at most 2^log2_hashmap_size entries; finer levels share them by hashing. None picks
-            the largest for which all levels together hold at most `parameter_ratio` times as many numbers as the picture.
-        parameter_ratio: of the picture's numbers, unless `log2_hashmap_size` is given. Sharing costs most in what is fine
-            everywhere, as grain, fur and letters; from about 0.8 on none are.
-        features_per_level: numbers per entry.
-        base_resolution: cells along the longer side of the first level, at most as many as pixels.
-        max_resolution: the same for the last level; None makes it as fine as the pixels.
+        num_levels: number of grids; equal ones are merged. None: a growth factor of about 2.4.
+        log2_hashmap_size: log2 of a level's maximum number of entries; finer levels are hashed. None: the largest within
+            `parameter_ratio`.
+        parameter_ratio: maximum number of grid parameters relative to the picture's numbers. From about 0.8 on nothing is
+            hashed; collisions cost most where the whole picture has fine detail (grain, fur, text).
+        features_per_level: features per entry.
+        base_resolution: cells along the longer side of the first level, at most one per pixel.
+        max_resolution: the same for the last level; None: one per pixel.
         width: neurons of the hidden layer.
         lr_scale: factor on the learning rate.
     """
@@ -54,19 +51,23 @@ class HashGrid2DField(PictureField):
         pixels, max_resolution = max(cells), min(max(cells), max_resolution or max(cells))
         first = max_resolution if num_levels == 1 else min(base_resolution, max_resolution)
         num_levels = num_levels or 1 + round(math.log(max_resolution / first) / math.log(PER_LEVEL_SCALE))
-        scaled = [
+        level_cells = [
             [max(1, round(c * r / pixels)) for c in cells] for r in level_resolutions(num_levels, first, max_resolution)
         ]
-        resolutions = list(dict.fromkeys((across, down) for across, down in scaled))  # a small picture has fewer
+        resolutions = list(
+            dict.fromkeys((across, down) for across, down in level_cells)
+        )  # small pictures repeat a level
         if log2_hashmap_size is None:
             numbers = parameter_ratio * 3 * size[0] * size[1]
-            fitting = [e for e in range(4, 25) if sum(table_sizes(resolutions, 2**e)) * features_per_level <= numbers]
-            log2_hashmap_size = max(fitting, default=4)
+            log2_sizes = [
+                e for e in range(4, 25) if sum(table_sizes(resolutions, 2**e)) * features_per_level <= numbers
+            ]
+            log2_hashmap_size = max(log2_sizes, default=4)
         self.grid = HashGrid(resolutions, log2_hashmap_size, features_per_level)
         self.net = build_layers(self.grid.width, width, 3)
 
     def warm_start_from(self, smaller: PictureField) -> None:
-        """Copies a field that has no other levels."""
+        """Copies a field whose levels are all among this one's."""
         assert isinstance(smaller, HashGrid2DField)
         if (columns := self.grid.warm_start_from(smaller.grid)) is not None:
             widen(linear_layers(self.net), linear_layers(smaller.net), columns)

@@ -1,4 +1,4 @@
-"""The original NeRF network (Mildenhall et al. 2020, figure 7), sized as the course does."""
+"""The original NeRF network (Mildenhall et al. 2020, figure 7), with the course's defaults."""
 
 import torch
 from jaxtyping import Float
@@ -14,13 +14,13 @@ from nerf_lightning.utils.option_checks import Count, Frequencies, Layers
 
 
 class MLPField(Field):
-    """A deep network of sinusoidally encoded position, with a view-dependent colour head.
+    """A deep MLP on the sinusoidally encoded position, with a view-dependent colour head.
 
     Args:
-        bounds: positions are scaled to [-1, 1] in them.
+        bounds: the box whose positions are scaled to [-1, 1].
         depth: hidden layers of the trunk.
         width: neurons in each.
-        skip: the layer that sees the encoded position again, or None.
+        skip: the layer that takes the encoded position again, or None.
         position_frequencies, direction_frequencies: octaves of the two encodings.
         density: "relu", "softplus" or "exp".
 
@@ -61,22 +61,22 @@ class MLPField(Field):
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
-        """Copies a network with the same encodings, both without a skip; further layers of the trunk pass on their input."""
+        """Copies a network with the same encodings, both without a skip; further trunk layers start as the identity."""
         assert isinstance(smaller, MLPField)
-        mine, its = ((f.skip, f.position_frequencies, f.direction_frequencies) for f in (self, smaller))
-        trunk, known = linear_layers(self.trunk), linear_layers(smaller.trunk)
-        if self.skip is not None or mine != its or len(known) > len(trunk):
+        ours, theirs = ((f.skip, f.position_frequencies, f.direction_frequencies) for f in (self, smaller))
+        trunk, smaller_trunk = linear_layers(self.trunk), linear_layers(smaller.trunk)
+        if self.skip is not None or ours != theirs or len(smaller_trunk) > len(trunk):
             return
         narrow = smaller.bottleneck.out_features
-        widen(trunk[: len(known)], known)
-        for layer in trunk[len(known) :]:  # its input has been through a ReLU, which a second one leaves alone
+        widen(trunk[: len(smaller_trunk)], smaller_trunk)
+        for layer in trunk[len(smaller_trunk) :]:  # its input is not negative, so its ReLU changes nothing
             layer.weight[:narrow] = torch.eye(layer.in_features)[:narrow]
             layer.bias[:narrow] = 0
         widen([self.density_head], [smaller.density_head])
         widen([self.bottleneck], [smaller.bottleneck])
-        head, its_head = linear_layers(self.colour_head), linear_layers(smaller.colour_head)
+        head, smaller_head = linear_layers(self.colour_head), linear_layers(smaller.colour_head)
         directions = torch.arange(self.bottleneck.out_features, head[0].in_features)
-        widen(head, its_head, torch.cat([torch.arange(narrow), directions]))
+        widen(head, smaller_head, torch.cat([torch.arange(narrow), directions]))
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
         x = sinusoidal(self.bounds.to_unit(positions) * 2 - 1, self.position_frequencies)
@@ -86,5 +86,5 @@ class MLPField(Field):
         return self.activation(self.density_head(h).squeeze(1)), h
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        seen = torch.cat([self.bottleneck(features), sinusoidal(directions, self.direction_frequencies)], dim=1)
-        return torch.sigmoid(self.colour_head(seen))
+        inputs = torch.cat([self.bottleneck(features), sinusoidal(directions, self.direction_frequencies)], dim=1)
+        return torch.sigmoid(self.colour_head(inputs))

@@ -1,4 +1,4 @@
-"""Pictures as networks of encoded coordinates: sinusoids of every octave, random sinusoids, or sinusoidal layers."""
+"""Coordinate networks for pictures: positional encoding, random Fourier features, and SIREN."""
 
 import math
 
@@ -13,7 +13,7 @@ from nerf_lightning.utils.option_checks import Count, Frequencies, Layers, Posit
 
 
 def build_relu_mlp(sizes: list[int]) -> torch.nn.Sequential:
-    """Fully connected layers of the given widths with ReLU between them."""
+    """Linear layers of the given widths with ReLU between them."""
     parts: list[torch.nn.Module] = [torch.nn.Linear(sizes[0], sizes[1])]
     for inputs, outputs in zip(sizes[1:-1], sizes[2:], strict=True):
         parts += [torch.nn.ReLU(), torch.nn.Linear(inputs, outputs)]
@@ -21,11 +21,11 @@ def build_relu_mlp(sizes: list[int]) -> torch.nn.Sequential:
 
 
 class PictureMLP(PictureField):
-    """Sinusoidal encoding, then a plain network (the course's NeRF2D).
+    """Sinusoidal encoding followed by an MLP (the course's NeRF2D).
 
     Args:
         size: see `PictureField`.
-        frequencies: octaves L of the encoding; 0 means the bare coordinates; None takes octaves up to about half the Nyquist
+        num_frequencies: octaves L of the encoding; 0: the bare coordinates; None: octaves up to about half the Nyquist
             frequency, as higher ones are unconstrained between the pixels.
         width: neurons of each hidden layer.
         depth: hidden layers.
@@ -36,30 +36,30 @@ class PictureMLP(PictureField):
     ):
         super().__init__(size)
         if num_frequencies is None:
-            # The last octave has 2^(L-1) / 2 cycles over the picture. At the Nyquist frequency itself a sine would have the
-            # same value at all pixels, up to its sign, and anything between them.
+            # The last octave has 2^(L-1) / 2 cycles over the picture. At the Nyquist frequency a sine has the same absolute
+            # value at all pixels and is unconstrained between them.
             num_frequencies = 1 + max(0, round(math.log2(self.nyquist)))
         self.num_frequencies = num_frequencies
         self.net = build_relu_mlp([2 * (1 + 2 * num_frequencies), *[width] * depth, 3])
 
     def warm_start_from(self, smaller: PictureField) -> None:
-        """Copies a network with as many layers and at most as many octaves, which come first here."""
+        """Copies a network of the same depth with at most the same number of octaves."""
         assert isinstance(smaller, PictureMLP)
         if len(self.net) == len(smaller.net) and smaller.num_frequencies <= self.num_frequencies:
             widen(linear_layers(self.net), linear_layers(smaller.net))
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        places = 0.5 + 0.5 * self.centred(uv)  # pixels stay square: octaves that suit the longer side suit the shorter
-        return torch.sigmoid(self.net(sinusoidal(places, self.num_frequencies)))
+        positions = 0.5 + 0.5 * self.centred(uv)  # square pixels: one set of octaves for both axes
+        return torch.sigmoid(self.net(sinusoidal(positions, self.num_frequencies)))
 
 
 class FourierField(PictureField):
-    """Sinusoids of random frequency and direction, then a plain network (Tancik et al. 2020, section 4 and 6.1).
+    """Random Fourier features followed by an MLP (Tancik et al. 2020, sections 4 and 6.1).
 
     Args:
         size: see `PictureField`.
         num_frequencies: number of random frequencies; each gives a sine and a cosine.
-        frequency_std: standard deviation of the frequencies, as a share of the Nyquist frequency.
+        frequency_std: standard deviation of the frequencies, relative to the Nyquist frequency.
         width: neurons of each hidden layer.
         depth: hidden layers.
         lr_scale: factor on the learning rate.
@@ -76,7 +76,7 @@ class FourierField(PictureField):
     ):
         super().__init__(size, lr_scale)
         self.cycles: Tensor
-        """[2, num_frequencies], over the picture's longer side; the seed decides them, and checkpoints keep them."""
+        """Random frequencies [2, num_frequencies], cycles over the picture's longer side."""
         self.register_buffer("cycles", torch.randn(2, num_frequencies) * frequency_std * self.nyquist)
         self.net = build_relu_mlp([2 * num_frequencies, *[width] * depth, 3])
 
@@ -86,18 +86,18 @@ class FourierField(PictureField):
 
 
 class SirenField(PictureField):
-    """A network with sines for activations (SIREN, Sitzmann et al. 2020, section 3.2 and supplement 1.5).
+    """An MLP with sine activations (SIREN, Sitzmann et al. 2020, section 3.2 and supplement 1.5).
 
     Args:
         size: see `PictureField`.
         width: neurons of each hidden layer.
         depth: hidden layers.
-        first_frequency: angular frequency of the first layer in Nyquist frequencies; 0.075 gives the paper's 30 for a
-            picture of 256 pixels.
+        first_frequency: angular frequency of the first layer relative to the Nyquist frequency; 0.075 gives the paper's 30
+            for a picture of 256 pixels.
         lr_scale: factor on the learning rate.
     """
 
-    HIDDEN_FREQUENCY = 30.0  # omega_0 of the later layers, which the paper keeps whatever the signal
+    HIDDEN_FREQUENCY = 30.0  # omega_0 of the later layers, independent of the signal as in the paper
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class SirenField(PictureField):
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
-        """Draws weights so that all layers' activations have equal variance; biases stay as the layers drew them."""
+        """Draws weights such that all layers' activations have equal variance; biases keep `nn.Linear`'s initialization."""
         for index, layer in enumerate([*self.hidden, self.last]):
             inputs = layer.weight.shape[1]
             bound = 1 / inputs if index == 0 else math.sqrt(6 / inputs) / self.HIDDEN_FREQUENCY

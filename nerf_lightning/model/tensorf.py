@@ -1,4 +1,4 @@
-"""TensoRF (Chen et al. 2022): volumes as sums of planes times lines, and the field that reads from them."""
+"""TensoRF (Chen et al. 2022): vector-matrix decomposed volumes and the radiance field on them."""
 
 from typing import Any
 
@@ -21,22 +21,22 @@ from nerf_lightning.model.layers.networks import build_layers, layer_parameters,
 from nerf_lightning.utils.option_checks import Count, Fraction, GridSize, Layers, SHDegree
 
 DEFAULT_MAX_RESOLUTION = 160
-"""Cells along a side at the end, where photos are of usual size."""
+"""Final cells along a side for photos of usual size."""
 DEFAULT_WIDTH = 32
-"""Neurons of the hidden layer there."""
+"""Neurons of the hidden layer for photos of usual size."""
 MIN_STEPS_PER_STAGE, MAX_STEPS_PER_STAGE = 80, 1000
-"""Steps that a stage needs before the next is worth its time, and after which it has learned what it can."""
+"""Minimum and maximum number of steps of each resolution stage before the last."""
 
 
 class VectorMatrix(torch.nn.Module):
     """Trainable planes times lines over the unit cube: TensoRF's vector-matrix decomposition (eq. 3).
 
     Args:
-        cells: along each side.
-        components: channels of each of the three planes, and of the lines across them.
+        cells: cells along each side.
+        components: channels of each of the three planes and lines.
     """
 
-    INIT_STD = 0.1  # standard deviation at the start, as in the authors' code
+    INIT_STD = 0.1  # as in the authors' code
 
     def __init__(self, cells: int, components: int):
         super().__init__()
@@ -50,12 +50,12 @@ class VectorMatrix(torch.nn.Module):
         return self.lines.shape[1] - 1
 
     def sum_components(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """The sum of all components at positions in the unit cube."""
+        """Sum of all components at positions in the unit cube."""
         return plane_line_sum(self.planes, self.lines, unit)
 
     @torch.no_grad()
     def resize(self, cells: int) -> None:
-        """Interpolates planes and lines onto another grid; the function stays the same if that has all the old vertices."""
+        """Resamples planes and lines; exact if the new grid contains all old vertices."""
         planes = self.planes.permute(0, 3, 1, 2)
         lines = self.lines.transpose(1, 2)
         planes = interpolate(planes, (cells + 1, cells + 1), mode="bilinear", align_corners=True)
@@ -65,11 +65,11 @@ class VectorMatrix(torch.nn.Module):
 
     @torch.no_grad()
     def warm_start_from(self, smaller: "VectorMatrix", zero_init: bool) -> None:
-        """Copies another volume's components and its size; further components are new.
+        """Copies the components and resolution of a volume with at most the same number of components.
 
         Args:
-            smaller: with at most as many components.
-            zero_init: whether the new ones add nothing at first, by lines of zero.
+            smaller: the volume to copy.
+            zero_init: whether the lines of new components start at zero.
         """
         new = self.lines.shape[2] - smaller.lines.shape[2]
         planes, lines = (self.INIT_STD * torch.randn(*old.shape[:-1], new) for old in (smaller.planes, smaller.lines))
@@ -79,47 +79,46 @@ class VectorMatrix(torch.nn.Module):
         replace_data(self.lines, torch.cat([smaller.lines, lines], dim=2))
 
     @torch.no_grad()
-    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
-        """Zeroes the vertices that no position in the reached cells reads."""
-        read = vertices_of_cells(find_visible_cells, self.cells)
+    def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
+        """Zeroes the vertices that no position in the visible cells reads."""
+        read = vertices_of_cells(visible_cells, self.cells)
         for mode in range(3):
             self.planes[mode][~read.any(mode)] = 0
             a, b = PLANE_AXES[mode]
             self.lines[mode][~read.any(b).any(a)] = 0
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """Takes the size of the loaded state, which may come from another stage of training."""
+        """Resizes to the resolution of the loaded state, which may come from another growth stage."""
         planes, lines = (state_dict.get(f"{prefix}{name}") for name in ("planes", "lines"))
         if planes is not None and lines is not None and lines.ndim == 3 and 1 < lines.shape[1] != self.lines.shape[1]:
             side = lines.shape[1]
-            if planes.shape[1:3] == (side, side):  # a state of which lines alone are long is refused, see below
+            if planes.shape[1:3] == (side, side):  # otherwise loading fails below
                 self.resize(side - 1)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 class TensoRFField(Field):
-    """TensoRF: density as a sum of planes times lines; colour from a small network of other such products and the direction.
+    """TensoRF: density as a sum of planes times lines; colour from a small network of such products and the direction.
 
-    The planes grow finer during training: a coarse grid finds the shape sooner. The network's first layer includes the
+    Planes are upsampled during training: a coarse grid finds the shape sooner. The network's first layer includes the
     paper's basis matrix.
 
     Args:
         bounds: the box the planes cover.
-        density_components, colour_components: channels of each plane. Multiples of 8 are the fast ones on a CPU.
-        base_resolution, max_resolution: cells along a side at the start and the end. None: 160, more for larger photos, see
+        density_components, colour_components: channels of each plane; multiples of 8 are fastest on a CPU.
+        base_resolution, max_resolution: initial and final cells along a side. None: 160, more for larger photos, see
             `Bounds.resolution_scale`.
-        stages: number of sizes, growing geometrically.
-        growth_end: fraction of the budget after which the planes have their finest size; earlier stages are equally long, of at
-            least `MIN_STEPS_PER_STAGE` and at most `MAX_STEPS_PER_STAGE` steps.
-        width: neurons of the hidden layer. Without a width: 32, and up to 64 where planes are finer for larger photos, which
-            show more of how surfaces shine.
-        degree: of the spherical harmonics of the direction that the network sees, 0 to 3; with 0, colours are the same from
-            everywhere. With few photos, less than 3 may be better.
+        stages: number of resolutions, growing geometrically.
+        growth_end: training progress at which the final resolution is reached; earlier stages have equal lengths, within
+            `MIN_STEPS_PER_STAGE` and `MAX_STEPS_PER_STAGE`.
+        width: neurons of the hidden layer. None: 32, up to 64 where larger photos make planes finer.
+        degree: degree of the spherical harmonics of the direction, 0 to 3; 0 makes colours view-independent. With few
+            photos, less than 3 may be better.
         density: "relu", "softplus" or "exp".
-        size: "auto" lowers both resolutions to what the photos can show; "fixed" takes them as they are.
+        size: "auto" limits both resolutions to what the photos resolve; "fixed" does not.
 
     Raises:
-        InputError: where base_resolution > max_resolution, and for a single stage of two sizes.
+        InputError: where base_resolution > max_resolution, and for a single stage with two resolutions.
     """
 
     max_lr = 0.2
@@ -140,16 +139,15 @@ class TensoRFField(Field):
     ):
         super().__init__(bounds)
         self.has_auto_resolution = max_resolution is None
-        finer = bounds.resolution_scale if max_resolution is None else 1.0
+        resolution_scale = bounds.resolution_scale if max_resolution is None else 1.0
         if max_resolution is None:
-            max_resolution = max(base_resolution, round(DEFAULT_MAX_RESOLUTION * finer))
+            max_resolution = max(base_resolution, round(DEFAULT_MAX_RESOLUTION * resolution_scale))
         if width is None:
-            width = 8 * round(DEFAULT_WIDTH * finer / 8)
+            width = 8 * round(DEFAULT_WIDTH * resolution_scale / 8)
         base_resolution, max_resolution = self.limit_resolutions(base_resolution, max_resolution, size)
         if stages == 1 and base_resolution < max_resolution:
-            raise InputError(
-                "model.stages", "", f"1 with sizes {base_resolution} and {max_resolution}", "at least 2, or one size"
-            )
+            problem = f"1 with sizes {base_resolution} and {max_resolution}"
+            raise InputError("model.stages", "", problem, "at least 2, or one size")
         self.resolutions = level_resolutions(stages, base_resolution, max_resolution)
         if base_resolution < max_resolution:
             starts = [growth_end * i / (stages - 1) for i in range(stages)]
@@ -172,31 +170,30 @@ class TensoRFField(Field):
         return self.activation(total), products
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """As `forward` gives it, without computing the colour."""
+        """Density of `forward`, without computing the colour."""
         return self.activation(self.density_volume.sum_components(self.bounds.to_unit(positions))) / self.unit_length
 
     def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        return torch.sigmoid(
-            mlp(features, layer_parameters(self.colour_net), encode_directions(directions, self.terms))
-        )
+        basis = encode_directions(directions, self.terms)
+        return torch.sigmoid(mlp(features, layer_parameters(self.colour_net), basis))
 
-    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
-        self.density_volume.prune(find_visible_cells)
-        self.colour_volume.prune(find_visible_cells)
+    def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
+        self.density_volume.prune(visible_cells)
+        self.colour_volume.prune(visible_cells)
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
-        """Copies everything and refines it to the finest size at once: the coarse sizes have done their work."""
+        """Copies all parameters and upsamples to the final resolution at once: coarse stages are already trained."""
         assert isinstance(smaller, TensoRFField)
-        # Densities are a plain sum; new colour components have no effect while their weights are zero.
+        # Density is a plain sum; new colour components have no effect while their network weights are zero.
         self.density_volume.warm_start_from(smaller.density_volume, zero_init=True)
         self.colour_volume.warm_start_from(smaller.colour_volume, zero_init=False)
         for volume in (self.density_volume, self.colour_volume):
             if volume.cells < self.resolutions[-1]:
                 volume.resize(self.resolutions[-1])
-        has, had = (volume.lines.shape[2] for volume in (self.colour_volume, smaller.colour_volume))
-        products = [mode * has + one for mode in range(3) for one in range(had)]
-        columns = torch.tensor([*products, *range(3 * has, 3 * has + smaller.terms)])
+        width, smaller_width = (volume.lines.shape[2] for volume in (self.colour_volume, smaller.colour_volume))
+        products = [mode * width + component for mode in range(3) for component in range(smaller_width)]
+        columns = torch.tensor([*products, *range(3 * width, 3 * width + smaller.terms)])
         widen(linear_layers(self.colour_net), linear_layers(smaller.colour_net), columns)
 
     def max_num_parameters(self) -> int:

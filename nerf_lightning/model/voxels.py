@@ -1,4 +1,4 @@
-"""A sparse grid of densities and spherical-harmonics colours, without any network (Plenoxels, Fridovich-Keil et al. 2022)."""
+"""Sparse voxel grid of densities and spherical-harmonics colours, without a network (Plenoxels, Fridovich-Keil et al. 2022)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,47 +26,46 @@ from nerf_lightning.model.layers.grid_masks import dilate, vertices_of_cells
 from nerf_lightning.utils.option_checks import GridSize, Gt, Layers, Le, LossWeight, PositiveFloat, SHDegree
 
 EMPTY_LOG_DENSITY = -8.0
-"""Logarithm of the density (in 1 / half-size) where no vertex is kept: too thin to matter."""
+"""Log-density (1 / half-size) of pruned vertices: practically transparent."""
 VISIBILITY_WINDOW = 0.5
-"""The last part of a stage; vertices read in it are kept."""
+"""Fraction at the end of a stage; vertices read in it survive pruning."""
 TV_SLICES = 4
-"""Each step measures the roughness of one of this many pieces of the table."""
+"""Number of slices of the table; each step computes the total variation of one."""
 TABLE_NAMES = ("log_density", "colours", "sh_coefficients")
 VERTICES_PER_CHUNK = 1 << 16
-"""Vertices interpolated at a time when growing, to bound the memory."""
-
+"""Vertices interpolated at a time when upsampling, to bound the memory."""
 BYTES_PER_VERTEX = 14
-"""Of a grid while it grows, kept or not: whether it is kept, twice, how many are before it, and its row."""
+"""Memory per grid vertex while upsampling: two masks, the running count and the row."""
 
 
 class VoxelField(Field):
-    """Vertices of a cubic grid over the bounds, each with a log-density, a colour, and what the direction adds to it.
+    """Vertices of a sparse cubic grid, each with log-density, colour and spherical-harmonics coefficients.
 
     All are interpolated trilinearly before the density's exponential and the colour's sigmoid, which keeps surfaces sharp
-    (DVGO, Sun et al. 2022, section 4). Training starts on a coarse, full grid. It grows finer in stages. Each new stage
-    keeps only what lies among vertices that samples read in the latter half of the one before: samplers pass on only what
-    light reaches, so this prunes by visibility. Row 0 stands for all vertices that are not kept, and never learns.
+    (DVGO, Sun et al. 2022, section 4). Training starts on a coarse, full grid that is upsampled in stages. Each stage keeps
+    only the neighbourhood of vertices read in the second half of the previous stage: samplers return only visible samples,
+    so this prunes by visibility. Row 0 is the shared constant for pruned vertices.
 
     Args:
         bounds: the box the grid covers.
-        base_resolution, max_resolution: cells along a side at the start and at the end.
-        stages: number of sizes, growing geometrically.
-        growth_end: fraction of the budget after which the grid has its finest size.
-        degree: of the spherical harmonics, 0 to 3; those above 0 depend on the direction.
+        base_resolution, max_resolution: initial and final cells along a side.
+        stages: number of resolutions, growing geometrically.
+        growth_end: training progress at which the final resolution is reached.
+        degree: degree of the spherical harmonics, 0 to 3; 0 makes colours view-independent.
         density_lr_scale: factor on the learning rate of the log-densities, relative to the colours'.
-        tv_weight: weight of the log-densities' squared differences between neighbours (Plenoxels, eq. 3, without the root).
-        size: "auto" lowers both resolutions to what the photos can show; "fixed" takes them as they are.
+        tv_weight: weight of the total variation of the log-densities (Plenoxels, eq. 3, without the root).
+        size: "auto" limits both resolutions to what the photos resolve; "fixed" does not.
 
     Raises:
         InputError: where base_resolution > max_resolution.
     """
 
     index: Tensor
-    """Row of every vertex; 0 for those that are not kept."""
+    """Row of every vertex; 0 for pruned ones."""
     vertex_of_row: Tensor
-    """Vertex of every row, its inverse."""
+    """Vertex of every row, the inverse of `index`."""
     last_read_step: Tensor
-    """Step of the last reading of every row."""
+    """Step at which each row was last read."""
 
     def __init__(
         self,
@@ -82,22 +81,21 @@ class VoxelField(Field):
     ):
         super().__init__(bounds)
         base_resolution, max_resolution = self.limit_resolutions(base_resolution, max_resolution, size)
-        # Early stages are short: a coarse grid learns what it can in a few steps a vertex.
+        # Early stages are short: a coarse grid converges in few steps.
         starts = [growth_end * (i / max(stages - 1, 1)) ** 2 for i in range(stages)]
-        self.growth: ResolutionSchedule = ResolutionSchedule(
-            level_resolutions(stages, base_resolution, max_resolution), starts
-        )
-        self.terms = num_sh_bases(degree) - 1  # without the constant one
+        resolutions = level_resolutions(stages, base_resolution, max_resolution)
+        self.growth: ResolutionSchedule = ResolutionSchedule(resolutions, starts)
+        self.terms = num_sh_bases(degree) - 1  # without the constant
         self.density_lr_scale = density_lr_scale
-        # Adam moves an entry by up to its rate in a step: log-densities that jump by more than 1 build fog in front of cameras.
+        # Adam moves an entry by up to its rate per step: log-density steps above 1 create fog in front of cameras.
         self.max_lr = 1 / density_lr_scale
         self.tv_weight = tv_weight
         for name, persistent in (("index", True), ("vertex_of_row", False), ("last_read_step", True)):
             self.register_buffer(name, None, persistent)
         self.stage, self.steps, self.stage_start = 0, 1, 1
-        """Of `growth`, steps so far, and the first one of the stage; on the host, as a step must not ask a device for them."""
+        """Growth stage, steps so far, and first step of the stage; on the host, to avoid device syncs."""
         vertices = (self.growth.resolutions[0] + 1) ** 3
-        self.log_density = torch.nn.Parameter(torch.zeros(1 + vertices))  # divided by density_rate
+        self.log_density = torch.nn.Parameter(torch.zeros(1 + vertices))  # divided by density_lr_scale
         self.log_density.data[0] = EMPTY_LOG_DENSITY / density_lr_scale
         self.colours = torch.nn.Parameter(torch.zeros(1 + vertices, 3))
         self.sh_coefficients = torch.nn.Parameter(torch.zeros(1 + vertices, 3 * self.terms))
@@ -105,7 +103,7 @@ class VoxelField(Field):
 
     @property
     def tables(self) -> tuple[torch.nn.Parameter, torch.nn.Parameter, torch.nn.Parameter]:
-        """All that vertices hold, one row per vertex."""
+        """Parameter tables, one row per vertex."""
         return self.log_density, self.colours, self.sh_coefficients
 
     @property
@@ -114,20 +112,20 @@ class VoxelField(Field):
 
     @property
     def occupied(self) -> Bool[Tensor, "V"]:
-        """Which vertices of the grid hold values."""
+        """Mask of the vertices with a row."""
         return self.index > 0
 
     @property
     def side(self) -> int:
-        """Current vertices along each side, kept or not."""
+        """Current vertices along each side, including pruned ones."""
         return round(len(self.index) ** (1 / 3))
 
     def density_from_raw(self, raw: Float[Tensor, "N"]) -> Float[Tensor, "N"]:
-        """Densities from what the table holds, 1 / world unit."""
+        """Density (1 / world unit) from values of the table."""
         return truncated_exp(self.density_lr_scale * raw) / self.unit_length
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """As `forward` gives it, but without marking the vertices as read."""
+        """Density of `forward`, without marking vertices as read."""
         return self.density_from_raw(interpolate_scalar(self.log_density, self.index, self.bounds.to_unit(positions)))
 
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
@@ -138,14 +136,14 @@ class VoxelField(Field):
             self.mark_read(rows)
         return FieldOutput(self.density_from_raw(raw), torch.sigmoid(rgb))
 
-    @torch.compiler.disable  # each step would be compiled again
+    @torch.compiler.disable  # each step would recompile
     def mark_read(self, rows: Int[Tensor, "N 8"]) -> None:
-        """Notes that a training step read these rows."""
+        """Records the rows read by a training step."""
         self.steps += 1
         mark_rows(self.last_read_step, rows, self.steps)
 
     def losses(self) -> dict[str, Float[Tensor, ""]]:
-        """The total variation of the log-densities, of another piece of the table in each step."""
+        """Total variation of the log-densities, over one slice of the table per step."""
         rows, piece = len(self.vertex_of_row) - 1, self.steps % TV_SLICES
         first, last = (1 + rows * i // TV_SLICES for i in (piece, piece + 1))
         if not self.tv_weight or first == last:
@@ -163,34 +161,32 @@ class VoxelField(Field):
         return list(self.tables)
 
     def set_vertices(self, keep: Bool[Tensor, "V"], tables: Sequence[Tensor]) -> None:
-        """Replaces the tables: row 0 for all other vertices, then those of the kept vertices in order."""
+        """Replaces the tables: row 0 for pruned vertices, then the kept vertices in order."""
         for table, columns in zip(self.tables, tables, strict=True):
             replace_data(table, columns.reshape(len(columns), *table.shape[1:]).contiguous())
         self.index = torch.where(keep, keep.cumsum(0), 0).int()
-        rows = self.index.nonzero()[:, 0]  # in the order of their vertices
+        rows = self.index.nonzero()[:, 0]  # in vertex order
         self.vertex_of_row = torch.cat([rows.new_tensor([-1]), rows]).int()
         self.last_read_step = torch.zeros(len(self.vertex_of_row), dtype=torch.int32, device=keep.device)
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
-        """Copies everything; from there it grows to its finest size in the usual number of stages."""
+        """Copies all tables; `growth` then starts at the copied resolution."""
         assert isinstance(smaller, VoxelField)
         cells = smaller.side - 1
         resolutions = self.growth.resolutions
         if cells > resolutions[-1]:
             return
         self.growth = replace(self.growth, resolutions=level_resolutions(len(resolutions), cells, resolutions[-1]))
-        sh_coefficients = smaller.sh_coefficients.view(len(smaller.sh_coefficients), 3, smaller.terms)[
-            ..., : self.terms
-        ]
-        wider = sh_coefficients.new_zeros(len(sh_coefficients), 3, self.terms)
-        wider[..., : sh_coefficients.shape[2]] = sh_coefficients
+        coefficients = smaller.sh_coefficients.view(len(smaller.sh_coefficients), 3, smaller.terms)[..., : self.terms]
+        padded = coefficients.new_zeros(len(coefficients), 3, self.terms)
+        padded[..., : coefficients.shape[2]] = coefficients
         density = smaller.log_density * (smaller.density_lr_scale / self.density_lr_scale)
-        self.set_vertices(smaller.occupied, [density, smaller.colours.detach(), wider.flatten(1)])
+        self.set_vertices(smaller.occupied, [density, smaller.colours.detach(), padded.flatten(1)])
 
     @torch.no_grad()
-    def prune(self, find_visible_cells: Bool[Tensor, "G G G"]) -> None:
-        keep = vertices_of_cells(find_visible_cells, self.side - 1).flatten() & self.occupied
+    def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
+        keep = vertices_of_cells(visible_cells, self.side - 1).flatten() & self.occupied
         rows = torch.cat([self.index.new_zeros(1), self.index[keep]]).long()
         self.set_vertices(keep, [table.detach()[rows] for table in self.tables])
 
@@ -203,15 +199,15 @@ class VoxelField(Field):
         self.load_state_dict({"index": state["occupied"].int(), **tables}, strict=False)
 
     def vertices_to_keep(self, side: int) -> Bool[Tensor, "S S S"]:
-        """Which vertices of a grid of side^3 lie among current vertices that were read lately, or next to those."""
-        fresh = self.last_read_step > self.steps - VISIBILITY_WINDOW * (self.steps + 1 - self.stage_start)
-        fresh[0] = False
+        """Mask of the vertices of a grid of side^3 that lie between recently read vertices, dilated by one."""
+        recently_read = self.last_read_step > self.steps - VISIBILITY_WINDOW * (self.steps + 1 - self.stage_start)
+        recently_read[0] = False
         old = self.side
-        keep = fresh[self.index.long()].view(old, old, old)
+        keep = recently_read[self.index.long()].view(old, old, old)
         at = torch.arange(side, device=keep.device) * (old - 1) / (side - 1)
         for axis in range(3):
             keep = keep.index_select(axis, at.floor().long()) & keep.index_select(axis, at.ceil().long())
-        # Before anything was rendered, everything stays.
+        # Keep all vertices before the first rendering.
         return dilate(keep) if keep.any() else torch.ones_like(keep)
 
     def get_extra_state(self) -> Tensor:
@@ -221,14 +217,14 @@ class VoxelField(Field):
         self.stage, self.steps, self.stage_start = state.tolist()
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """Takes the size of the loaded state: a grid of another stage has other shapes.
+        """Resizes to the loaded state, which may come from another growth stage.
 
         Raises:
-            RuntimeError: where vertices are none of a cubic grid.
+            RuntimeError: if the vertices do not form a cubic grid.
         """
         index = state_dict.get(f"{prefix}index", self.index)
         if index.ndim != 1 or round(len(index) ** (1 / 3)) ** 3 != len(index) or not len(index):
-            raise RuntimeError("vertices that are none of a cubic grid")
+            raise RuntimeError("the vertices in `index` do not form a cubic grid")
         keep = index.to(self.bounds.aabb.device) > 0
         rows = int(keep.sum()) + 1
         self.set_vertices(keep, [table.new_empty(rows, table[0].numel()) for table in self.tables])

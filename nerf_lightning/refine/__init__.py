@@ -1,4 +1,4 @@
-"""Between cameras and samplers: small corrections of cameras and light, learned together with the field."""
+"""Pose refinement and color correction of the training photos, learned with the field."""
 
 from nerf_lightning.refine.color_correction import ColorCorrection
 from nerf_lightning.refine.corrections import Corrections

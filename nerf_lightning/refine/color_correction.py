@@ -1,4 +1,4 @@
-"""Color correction: gains of each photo's exposure and white balance, and vignetting, learned with the field."""
+"""Color correction: per-photo gains of exposure and white balance, and vignetting, learned with the field."""
 
 import copy
 from collections.abc import Sequence
@@ -11,21 +11,21 @@ from nerf_lightning.cameras import Cameras, Projection, Rays
 from nerf_lightning.errors import InputError
 
 GAMMA = 2.2
-"""Of sRGB, about: pixels grow with the light to the power of 1 / GAMMA."""
+"""Approximate gamma of sRGB: pixel values grow with radiance^(1 / GAMMA)."""
 
 
 class ColorCorrection(torch.nn.Module):
-    """Gains of V photos' colours; at the start all are 1.
+    """Colour gains of V photos, initially 1.
 
     Args:
         cameras: of the photos, as given.
-        exposures: light that each photo gathered, in any unit, as its file states; empty where that is not known.
-        affine: whether the colours of each photo are mixed and shifted too.
-        vignetting: whether photos may be darker toward their corners, all alike.
-        fix_mean: whether the mean of all gains stays 1, so that the scene does not grow brighter.
+        exposures: exposure of each photo from its metadata, in any unit; empty if unknown.
+        affine: also learns a 3x4 colour matrix of each photo.
+        vignetting: also learns darker corners, the same in all photos.
+        fix_mean: keeps the mean gain at 1, so that the scene does not brighten.
 
     Raises:
-        InputError: for vignetting of photos of all directions.
+        InputError: for vignetting of equirectangular photos.
     """
 
     exif_log_gains: Tensor
@@ -42,14 +42,14 @@ class ColorCorrection(torch.nn.Module):
         super().__init__()
         lenses = cameras.lenses
         if vignetting and lenses is not None and bool((lenses.projection == Projection.EQUIRECTANGULAR).any()):
-            raise InputError("refine.vignetting", "", "true, with photos of all directions", "false for these")
+            raise InputError("refine.vignetting", "", "true, with equirectangular photos", "false for these")
         logs = torch.tensor(exposures).log() / GAMMA if exposures else torch.zeros(len(cameras))
         self.register_buffer("exif_log_gains", (logs - logs.mean())[:, None].expand(-1, 3).clone(), persistent=False)
         self.register_buffer("optical_axes", cameras.c2w[:, :3, 2].clone(), persistent=False)
         half = cameras.sizes.to(cameras.K) / 2
         corners = torch.maximum(cameras.K[:, :2, 2], 2 * half - cameras.K[:, :2, 2])
         self.corner_tan_squared = float((corners / cameras.K[:, [0, 1], [0, 1]]).square().sum(1).max())
-        """Of the angle to the axis in the farthest corner."""
+        """Squared tangent of the angle to the axis in the farthest corner."""
         self.log_gains = torch.nn.Parameter(torch.zeros(len(cameras), 3), requires_grad=False)
         self.color_matrices = (
             torch.nn.Parameter(torch.zeros(len(cameras), 3, 4), requires_grad=False) if affine else None
@@ -59,29 +59,26 @@ class ColorCorrection(torch.nn.Module):
 
     @property
     def is_active(self) -> bool:
-        """Whether colours are corrected."""
         return self.log_gains.requires_grad
 
     @property
     def gains(self) -> Float[Tensor, "V 3"]:
-        """Factors on each photo's red, green and blue."""
+        """Gains of each photo's red, green and blue."""
         return self._subtract_mean(self.log_gains).exp()
 
     @property
     def corner_brightness(self) -> Float[Tensor, ""] | None:
-        """Of the farthest corner, as a share of that on the axis, if photos may have vignetting."""
+        """Brightness of the farthest corner relative to the axis; None without vignetting."""
         return None if self.vignetting_coefficients is None else (-self.vignetting_coefficients.sum()).exp()
 
     def init_from_exif(self) -> None:
-        """Starts from the exposures that files state."""
+        """Initializes the gains from the photos' stated exposures."""
         self.log_gains.data.copy_(self.exif_log_gains)
 
     def copy_lens(self, other: "ColorCorrection") -> None:
-        """Takes the vignetting of another correction, not learned any further."""
-        self.vignetting_coefficients, self.corner_tan_squared = (
-            copy.deepcopy(other.vignetting_coefficients),
-            other.corner_tan_squared,
-        )
+        """Copies another correction's vignetting and freezes it."""
+        self.vignetting_coefficients = copy.deepcopy(other.vignetting_coefficients)
+        self.corner_tan_squared = other.corner_tan_squared
         if self.vignetting_coefficients is not None:
             self.vignetting_coefficients.requires_grad_(False)
 
@@ -97,16 +94,16 @@ class ColorCorrection(torch.nn.Module):
         views: Int[Tensor, "R"],
         truth: Float[Tensor, "R 3"] | None = None,
     ) -> Float[Tensor, "R 3"]:
-        """Rendered colours as these photos show them; what is behind stays as it is.
+        """Corrects rendered foreground colours to look as in their photos; the background stays.
 
-        Where a photo's own colours are given and are burnt out (1), those that are brighter still count as equal.
+        Where `truth` is saturated (1), brighter colours are clamped to it.
 
         Args:
             rgb, opacity: rendered.
             backgrounds: colours behind.
-            rays: the pixels' rays, by the cameras as given.
-            views: the photos.
-            truth: their own colours.
+            rays: of the pixels, from the cameras as given.
+            views: photo of each ray.
+            truth: the photos' pixels.
         """
         if not self.is_active:
             return rgb
@@ -124,11 +121,11 @@ class ColorCorrection(torch.nn.Module):
         return corrected if truth is None else torch.where(truth >= 1, corrected.clamp_max(1), corrected)
 
     def compute_vignetting(self, directions: Float[Tensor, "R 3"], views: Int[Tensor, "R"]) -> Float[Tensor, "R 1"]:
-        """Factor on the colours of pixels with these directions of the cameras as given: 1 on the axis.
+        """Vignetting factor exp(-a r^2 - b r^4) of ray directions of the cameras as given: 1 on the axis.
 
-        exp(-a r^2 - b r^4), where r is the tangent of the angle to the axis, 1 in the farthest corner.
+        r is the tangent of the angle to the axis, relative to that of the farthest corner.
         """
-        assert self.vignetting_coefficients is not None  # asked for by the caller
+        assert self.vignetting_coefficients is not None  # checked by the caller
         cosine = (directions * self.optical_axes.index_select(0, views)).sum(1, keepdim=True)
         tan_squared = cosine.square().clamp_min(torch.finfo(cosine.dtype).eps).reciprocal() - 1
         square = tan_squared / self.corner_tan_squared

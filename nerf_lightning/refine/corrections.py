@@ -1,4 +1,4 @@
-"""Corrections of the training photos' cameras and colours, and how fast each is learned."""
+"""Corrections: pose refinement and color correction of the training photos, and their learning rates."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -12,16 +12,16 @@ from nerf_lightning.refine.pose_refinement import PoseRefinement
 from nerf_lightning.utils.option_checks import PositiveFloat
 
 START_PROGRESS = 0.02
-"""Share of the training before which nothing is corrected: photos cannot fit a field that shows nothing yet."""
+"""Refinement starts after this fraction of training, once the field has coarse content."""
 LR_FINAL_FACTOR = 0.1
 """Factor on the learning rates at the end."""
 BOOST_PROGRESS, BOOST_MOTION_PX, POSE_LR_BOOST = 0.1, 4.0, 3.0
-"""Poses move `POSE_LR_BOOST` times as fast for a first share of the training, and then where they have moved far: with the root
-mean square of how far the content has moved in the photos, above `BOOST_MOTION_PX`. What is far off would else not arrive."""
+"""Poses learn `POSE_LR_BOOST` times as fast for this fraction of training, and later in proportion to their RMS motion above
+`BOOST_MOTION_PX`, so that large errors converge."""
 GROWTH_DELAY_PROGRESS = 0.4
-"""Share of the training that it takes, once poses are corrected, until the field has grown."""
+"""Fraction of training from the start of pose refinement until the field has its full size."""
 REQUIRED_CORRECTION = {"focal": "poses", "affine": "exposure", "vignetting": "exposure"}
-"""What is a part of what."""
+"""Correction that each option belongs to."""
 
 
 class Corrections(torch.nn.Module):
@@ -30,19 +30,18 @@ class Corrections(torch.nn.Module):
     Args:
         cameras: of the V photos, as given.
         bounds: of the content.
-        exposures: see `ColorCorrection`. Gains start from them; with `auto` only if that lowers the error.
-        poses: whether cameras turn and move.
-        exposure: whether photos have gains.
-        focal: whether, with poses, the focal length that all photos share is corrected.
-        affine, vignetting: with exposure, see `ColorCorrection`.
-        pose_lr: learning rate of poses, in pixels that the content moves a step.
-        exposure_lr: learning rate of the gains' logarithms.
-        auto: whether each is corrected from the first trial on that shows that it helps, and else not.
-        fix_gauge: whether what all photos have in common stays as it is; photos of a field that is already there have their
-            own.
+        exposures: see `ColorCorrection`; they initialize the gains, with `auto` only if that lowers the error.
+        poses: refines rotation and translation of each camera.
+        exposure: learns gains of each photo.
+        focal: with `poses`, also refines the focal length, one factor for all photos.
+        affine, vignetting: with `exposure`, see `ColorCorrection`.
+        pose_lr: learning rate of poses, in pixels of content motion per step.
+        exposure_lr: learning rate of the log gains.
+        auto: enables a correction only once a trial shows that it helps.
+        fix_gauge: projects out gauge freedom (global similarity, mean gain); false for photos of a trained field.
 
     Raises:
-        InputError: where neither is to be corrected, and for a part of what is not.
+        InputError: if nothing is to be corrected, and for an option without its correction.
     """
 
     def __init__(
@@ -67,49 +66,49 @@ class Corrections(torch.nn.Module):
             raise InputError(
                 "refine.poses", "", "false, with refine.exposure=false", "one of them", "or give refine=null"
             )
-        for part, is_asked in {"focal": focal, "affine": affine, "vignetting": vignetting}.items():
-            if is_asked and (required := REQUIRED_CORRECTION[part]) not in self.learning_rates:
+        for part, is_enabled in {"focal": focal, "affine": affine, "vignetting": vignetting}.items():
+            if is_enabled and (required := REQUIRED_CORRECTION[part]) not in self.learning_rates:
                 found, hint = f"true, with refine.{required}=false", f"or give refine.{required}=true"
                 raise InputError(f"refine.{part}", "", found, "false", hint)
         self.poses = PoseRefinement(cameras, bounds, focal, fix_gauge)
         self.color = ColorCorrection(cameras, exposures, affine, vignetting, fix_gauge)
         self.auto = auto
         self.last_error_reduction: dict[str, float] = {}
-        """Share of the squared error that the last trial of `auto` explained, by what it was about."""
+        """Relative error reduction of each correction in the last trial of `auto`."""
         self.enabled_at: dict[str, float] = {}
-        """What is corrected, and from which progress on."""
+        """Training progress at which each correction was enabled."""
         if not auto:
             self.enable(START_PROGRESS, *self.learning_rates)
             if exposure:
                 self.color.init_from_exif()
 
     def group_parameters(self, name: str) -> list[torch.nn.Parameter]:
-        """What is learned of "poses", or of "exposure"."""
+        """Parameters of "poses" or "exposure"."""
         return list((self.poses if name == "poses" else self.color).parameters())
 
     def enable(self, progress: float, *names: str) -> None:
-        """Corrects poses or light from now on."""
+        """Enables corrections from now on."""
         for name in names:
             self.enabled_at[name] = progress
             for parameter in self.group_parameters(name):
                 parameter.requires_grad_(True)
 
     def enable_poses(self) -> None:
-        """Corrects poses, if they may be, from the first step on, as they are certainly wrong: they have far to go, and a field
-        that explains them by fog would let no trial tell."""
+        """Enables pose refinement from the first step on, for poses known to be wrong: a field that explains large errors by
+        fog would let no trial detect them."""
         if "poses" in self.learning_rates and "poses" not in self.enabled_at:
             self.enable(0.0, "poses")
 
     def record_trial(
         self, progress: float, names: Sequence[str], error_reductions: dict[str, float], init_from_exif: bool
     ) -> None:
-        """Takes in a trial of `auto`.
+        """Records a trial of `auto` and enables what helps.
 
         Args:
             progress: of the training.
-            names: what helps, to be corrected from now on.
+            names: corrections that help.
             error_reductions: see `last_error_reduction`.
-            init_from_exif: whether gains, if they help, start from the stated exposures.
+            init_from_exif: whether gains start from the stated exposures.
         """
         self.last_error_reduction |= error_reductions
         self.enable(progress, *names)
@@ -117,29 +116,27 @@ class Corrections(torch.nn.Module):
             self.color.init_from_exif()
 
     def trial_state(self) -> dict[str, Any]:
-        """What the parameters do not say, for `load_trial_state`."""
+        """State that the parameters do not hold, for `load_trial_state`."""
         return {"last_error_reduction": self.last_error_reduction, "enabled_at": self.enabled_at}
 
     def load_trial_state(self, state: dict[str, Any]) -> None:
-        """Goes on as decided before."""
+        """Restores the enabled corrections of a checkpoint."""
         self.last_error_reduction = dict(state["last_error_reduction"])
         for name, progress in state["enabled_at"].items():
             self.enable(progress, name)
 
     @property
     def is_finite(self) -> bool:
-        """Whether all of it are finite numbers: some are not any more where training has broken down."""
+        """Whether all parameters are finite; after divergence some are not."""
         return all(bool(tensor.isfinite().all()) for tensor in self.state_dict().values())
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups: what is or may be corrected, each with its learning rate."""
-        return [
-            {"name": name, "params": self.group_parameters(name), "lr": rate}
-            for name, rate in self.learning_rates.items()
-        ]
+        """Parameter groups of all possible corrections, each with its learning rate."""
+        rates = self.learning_rates
+        return [{"name": name, "params": self.group_parameters(name), "lr": lr} for name, lr in rates.items()]
 
     def lr_factors(self, progress: float) -> dict[str, float]:
-        """Factors on the rates of these groups, by progress in training: nothing at first, then from 1 down."""
+        """Learning-rate factors of the groups: 0 until enabled, then from 1 down."""
         factors = dict.fromkeys(self.learning_rates, 0.0)
         for name, start in self.enabled_at.items():
             if progress >= start:
@@ -148,23 +145,21 @@ class Corrections(torch.nn.Module):
         return factors
 
     def _pose_lr_boost(self, elapsed: float) -> float:
-        """Factor on the rate of poses, by how far they have moved since a share of the training ago."""
+        """Learning-rate factor of poses, `elapsed` progress after they were enabled."""
         if elapsed < BOOST_PROGRESS:
             return POSE_LR_BOOST
         motion_px = float(self.poses.pose_adjustment.detach().square().sum(1).mean().sqrt())  # in pixels
         return min(POSE_LR_BOOST, max(1.0, motion_px / BOOST_MOTION_PX))
 
     def delay_growth(self, progress: float, growth_end: float) -> float:
-        """The progress by which a field grows: slower while cameras find their places, as detail would hold them where they
-        are."""
+        """Progress by which a field grows: slower during pose refinement, as fine detail would hold cameras where they are."""
         start = self.enabled_at.get("poses", 1.0)
         if not start < growth_end or progress < start:
             return progress
         return min(progress, start + (growth_end - start) * (progress - start) / GROWTH_DELAY_PROGRESS)
 
     def make_held_out_corrections(self, cameras: Cameras, bounds: Bounds) -> "Corrections":
-        """Corrections of the same kinds for other photos of the field that was trained with these: by the same lens, and with
-        gains alone."""
+        """Makes the same kinds of corrections for held-out cameras: the same lens, own poses and gains."""
         poses, exposure = ("poses" in self.enabled_at), ("exposure" in self.enabled_at)
         other = Corrections(cameras, bounds, poses=poses, exposure=exposure, fix_gauge=False)
         other.poses.copy_lens(self.poses)

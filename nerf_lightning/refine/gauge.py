@@ -1,23 +1,23 @@
-"""Small motions of cameras: what they do to rays, and to where places appear in the photos."""
+"""Camera motions: axis-angle rotation, projection Jacobian, gauge modes, and preconditioner of pose refinement."""
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 DISTANCE_DAMPING = 1e-3
-"""Share of the mean squared distance that is added to all, for cameras in the middle of the content."""
+"""Fraction of the mean squared distance that is added to each, for cameras at the centre of the content."""
 RANK_TOLERANCE = 1e-6
-"""Vectors whose own part is smaller than this, as a share of their length, are made of others."""
+"""Relative singular value below which a direction counts as linearly dependent."""
 TAYLOR_MAX_ANGLE_SQUARED = 1e-6
-"""Squared angle below which a series stands in for the factors of a turn, so that gradients exist at 0 too."""
+"""Squared angle below which Rodrigues' factors are Taylor series, so that gradients exist at 0."""
 
 
 def rotate_axis_angle(vectors: Float[Tensor, "R 3"], rotations: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-    """Vectors, each rotate about an axis (Rodrigues' formula).
+    """Rotates each vector about its axis (Rodrigues' formula).
 
     Args:
         vectors: of any length.
-        rotations: the axes' directions, as long as the angles are in radians.
+        rotations: unit axis times angle in radians.
     """
     square = rotations.square().sum(1, keepdim=True)
     small = square < TAYLOR_MAX_ANGLE_SQUARED
@@ -31,7 +31,7 @@ def rotate_axis_angle(vectors: Float[Tensor, "R 3"], rotations: Float[Tensor, "R
 def compute_projection_jacobian(
     centres: Float[Tensor, "V 3"], focals: Float[Tensor, "V"], points: Float[Tensor, "P 3"]
 ) -> Float[Tensor, "V P 3 6"]:
-    """How far places move in each photo, per unit of a small turn and a small move of its camera.
+    """Jacobian of the points' projections in the rotation and translation of each camera.
 
     Args:
         centres: of the cameras, world frame.
@@ -39,30 +39,30 @@ def compute_projection_jacobian(
         points: world frame.
 
     Returns:
-        Derivatives of the direction from the camera, in pixels at the photo's centre, as vectors of the camera's frame written
-        along world axes. The first three columns are of a turn about the camera's centre (world axes, radians), the last three
-        of a move of it (world units).
+        Derivatives of the direction from the camera, in pixels at the image centre, along world axes. Columns 0 to 2: rotation
+        about the camera centre (world axes, radians); 3 to 5: its translation (world units).
     """
     offsets = points - centres[:, None]
     distance = offsets.norm(dim=2)[..., None, None]
     ray = offsets[..., None] / distance
     axes = torch.eye(3, dtype=ray.dtype, device=ray.device).expand(*ray.shape[:2], 3, 3)
-    # Seen from a camera that turns by w and moves by m, a place at p moves by p x w - m.
+    # Seen from a camera that rotates by w and translates by m, a point p moves by p x w - m.
     rotation = torch.linalg.cross(offsets[:, :, None].expand_as(axes), axes, dim=3).mT
     return focals[:, None, None, None] * (axes - ray * ray.mT) @ torch.cat([rotation, -axes], dim=3) / distance
 
 
 def compute_gauge_modes(centres: Float[Tensor, "V 3"], content_centre: Float[Tensor, "3"]) -> Float[Tensor, "V 6 10"]:
-    """Motions of all cameras together that photos do not tell, or hardly: of cameras and content as a whole, and of the content
-    alone, which far cameras follow by turning.
+    """Gauge modes: joint camera motions that photos cannot, or hardly, constrain.
+
+    The 7-DoF similarity, and translations of the content, which distant cameras absorb by rotating.
 
     Args:
         centres: of the cameras, world frame.
-        content_centre: the middle of the content, world frame.
+        content_centre: world frame.
 
     Returns:
-        Per camera a turn and a move as in `compute_projection_jacobian`; columns: three shifts, three turns and the growth of
-        everything, and for three shifts of the content.
+        Rotation and translation of each camera as in `compute_projection_jacobian`. Columns: translation (3), rotation (3) and
+        scale (1) of everything, translation of the content (3).
     """
     axes = torch.eye(3, dtype=centres.dtype, device=centres.device).expand(len(centres), 3, 3)
     zeros, offsets = torch.zeros_like(axes), (centres - content_centre)[:, :, None]
@@ -75,13 +75,13 @@ def compute_gauge_modes(centres: Float[Tensor, "V 3"], content_centre: Float[Ten
 
 
 def compute_preconditioner(jacobian: Float[Tensor, "V P 3 6"], damping: float) -> Float[Tensor, "V 6 6"]:
-    """For each photo the matrix that turns a vector of unit length into a motion that shifts places by about a pixel.
+    """Preconditioner of each photo: maps unit vectors to motions that shift points by about a pixel.
 
-    The inverse square root of the mean of J^T J, damped: Park et al. 2023, "CamP", section 4.
+    The inverse square root of the damped mean of J^T J: Park et al. 2023, "CamP", section 4.
 
     Args:
         jacobian: J, see `compute_projection_jacobian`.
-        damping: share of each motion's own effect that is added, so that motions which hardly show do not grow without limit.
+        damping: relative to the diagonal; bounds motions that hardly show.
     """
     square = (jacobian.mT @ jacobian).mean(1)
     square = square + damping * torch.diag_embed(square.diagonal(dim1=1, dim2=2))
@@ -90,12 +90,12 @@ def compute_preconditioner(jacobian: Float[Tensor, "V P 3 6"], damping: float) -
 
 
 def orthonormal_basis(vectors: Float[Tensor, "N K"]) -> Float[Tensor, "N B"]:
-    """An orthonormal basis of what some columns span."""
+    """Orthonormal basis of the column space."""
     lengths = vectors.norm(dim=0).clamp_min(torch.finfo(vectors.dtype).tiny)
     basis, sizes, _ = torch.linalg.svd(vectors / lengths, full_matrices=False)
     return basis[:, sizes > RANK_TOLERANCE]
 
 
 def project_out(vectors: Float[Tensor, "V K"], basis: Float[Tensor, "VK B"]) -> Float[Tensor, "V K"]:
-    """What is left of vectors, taken as one long one, off an orthonormal basis."""
+    """Removes from the flattened vectors their component in the span of an orthonormal basis."""
     return vectors - (basis * (basis * vectors.flatten()[:, None]).sum(0)).sum(1).view_as(vectors)

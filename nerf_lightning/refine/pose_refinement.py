@@ -1,4 +1,4 @@
-"""Pose refinement: a small turn and move of each photo's camera, and a factor on the focal length, learned with the field."""
+"""Pose refinement: rotation and translation of each camera, and a focal length factor, learned with the field."""
 
 import copy
 from dataclasses import replace
@@ -20,22 +20,22 @@ from nerf_lightning.refine.gauge import (
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 NUM_POINTS = 512
-"""Points in the box by which the motion of a camera is measured."""
+"""Random points in the bounds by which camera motion is measured."""
 PRECONDITIONER_DAMPING = 1.0
-"""See `compute_preconditioner`. A turn and a move of a camera that undo each other in the photo converge slowly."""
+"""See `compute_preconditioner`. Rotation and translation that cancel in the photo converge slowly."""
 
 
 class PoseRefinement(torch.nn.Module):
-    """Motions of V cameras, preconditioned to pixels (Park et al. 2023, "CamP"); at the start there are none.
+    """Motions of V cameras, preconditioned to pixels (Park et al. 2023, "CamP"), initially zero.
 
     Args:
         cameras: as given.
         bounds: of the content.
-        focal: whether the focal length that all photos share is refined too.
-        fix_gauge: whether what all cameras have in common stays as it is, so that the scene does not drift away.
+        focal: also refines the focal length, one factor for all photos.
+        fix_gauge: projects out joint motions of all cameras, so that the scene does not drift.
 
     Raises:
-        InputError: for a focal length of lenses that have none.
+        InputError: for `focal` with lenses that have no focal length.
     """
 
     preconditioner: Tensor
@@ -45,7 +45,7 @@ class PoseRefinement(torch.nn.Module):
     def __init__(self, cameras: Cameras, bounds: Bounds, focal: bool = False, fix_gauge: bool = True):
         super().__init__()
         if focal and cameras.lenses is not None and bool((cameras.lenses.projection != Projection.PERSPECTIVE).any()):
-            found = "true, with fisheye lenses or photos of all directions"
+            found = "true, with fisheye or equirectangular photos"
             raise InputError("refine.focal", "", found, "false for these")
         centres, content_centre = cameras.centres.cpu().double(), bounds.centre.cpu().double()
         corners = torch.rand(NUM_POINTS, 3, dtype=torch.float64, generator=step_generator(0, Stream.ANALYSIS, 0))
@@ -60,36 +60,34 @@ class PoseRefinement(torch.nn.Module):
         self.pose_adjustment = torch.nn.Parameter(torch.zeros(len(cameras), 6), requires_grad=False)
         self.fix_gauge = fix_gauge
         self.focal_preconditioner = float(2 / (cameras.sizes.to(cameras.K) / 2).norm(dim=1).median())
-        """So that `log_focal` is in pixels halfway to the corners."""
+        """Scales `log_focal` to pixels halfway to the corners."""
         self.log_focal = torch.nn.Parameter(torch.zeros(()), requires_grad=False) if focal else None
 
     @property
     def is_active(self) -> bool:
-        """Whether cameras move."""
+        """Whether poses are refined."""
         return self.pose_adjustment.requires_grad
 
     @property
     def focal_factor(self) -> Float[Tensor, ""] | None:
-        """On the focal length, if that is refined."""
+        """Factor on the focal length; None if it is not refined."""
         return None if self.log_focal is None else (self.focal_preconditioner * self.log_focal).exp()
 
     def copy_lens(self, other: "PoseRefinement") -> None:
-        """Takes the focal length of another refinement, not learned any further."""
+        """Copies another refinement's focal length and freezes it."""
         self.log_focal = copy.deepcopy(other.log_focal)
         if self.log_focal is not None:
             self.log_focal.requires_grad_(False)
 
     def compute_pose_deltas(self) -> tuple[Float[Tensor, "V 3"], Float[Tensor, "V 3"]]:
-        """Of each camera: about its centre (world axes, radians), and of it (world units)."""
+        """Rotation (world axes, radians) and translation (world units) of each camera."""
         adjustment = project_out(self.pose_adjustment, self.gauge) if self.fix_gauge else self.pose_adjustment
-        deltas = (self.preconditioner * adjustment[:, None]).sum(
-            2
-        )  # no matrix product, which half precision would round
-        rotations, translations = deltas.split(3, dim=1)
+        # Not a matrix product, which autocast would round to half precision.
+        rotations, translations = (self.preconditioner * adjustment[:, None]).sum(2).split(3, dim=1)
         return rotations, translations
 
     def forward(self, rays: Rays, views: Int[Tensor, "R"]) -> Rays:
-        """Rays of these photos, as their refined cameras see."""
+        """Moves rays with the refined cameras of their photos."""
         if not self.is_active:
             return rays
         directions = rays.directions
@@ -102,7 +100,7 @@ class PoseRefinement(torch.nn.Module):
 
     @torch.no_grad()
     def refine_cameras(self, cameras: Cameras) -> Cameras:
-        """The cameras as refined."""
+        """Applies the refinement to the cameras."""
         rotations, translations = (x.to(cameras.c2w) for x in self.compute_pose_deltas())
         c2w = cameras.c2w.clone()
         for column in range(3):

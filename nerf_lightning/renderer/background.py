@@ -1,4 +1,4 @@
-"""The color behind a scene: rays that meet nothing show it."""
+"""Background colors of rays that hit nothing."""
 
 from collections.abc import Sequence
 
@@ -13,11 +13,11 @@ SCENE_CHOICES = ("scene", "random", "auto")
 
 
 class Background(torch.nn.Module):
-    """One color, or in training a random one for each ray.
+    """Constant background color, or in training a random one per ray.
 
     Args:
         choice: see `VolumeRenderer`.
-        scene_color: what "scene" stands for.
+        scene_color: the color of "scene".
         has_alpha: whether the photos have alpha.
 
     Raises:
@@ -40,7 +40,7 @@ class Background(torch.nn.Module):
         self.register_buffer("color", torch.tensor(color), persistent=False)
 
     def sample(self, count: int, generator: Generator | None = None) -> Float[Tensor, "R 3"]:
-        """The color behind each of `count` rays; random only in training, when a generator is given."""
+        """Background colors of `count` rays; random only with a generator (training)."""
         if self.is_random and generator is not None:
             return torch.rand(count, 3, generator=generator, device=self.color.device)
         return self.color.expand(count, 3)

@@ -1,4 +1,4 @@
-"""Stage 3, samplers: Rays -> Samples, where along each ray the field is evaluated."""
+"""Stage 3, samplers: Rays -> Samples, the intervals along each ray at which the field is evaluated."""
 
 from nerf_lightning.sampler.occupancy import OccupancySampler
 from nerf_lightning.sampler.occupancy_grid import OccupancyGrid

@@ -1,4 +1,4 @@
-"""Proposals: a small field of density alone learns where the large one's samples are worth their time."""
+"""Proposal network sampling (mip-NeRF 360): a small density field predicts where to sample the main field."""
 
 from typing import Annotated, Any
 
@@ -14,28 +14,27 @@ from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposal
 from nerf_lightning.utils.option_checks import Count, GridSize, Gt, Layers, Le, Log2Size, Lt
 
 INIT_LOG_DENSITY = -1.0
-"""Logarithm of the density that proposals begin with, 1 / half-size: thin fog."""
+"""Initial log-density of the proposal field, 1 / half-size: thin fog."""
 ANNEAL_SLOPE = 10.0
-"""How quickly proposals come to count in full."""
+"""Slope of the annealing bias curve (mip-NeRF 360, section 3.2)."""
 
 
 class ProposalSampler(Sampler):
-    """As many samples on every ray, most of them where a small field expects surfaces.
+    """A fixed number of samples per ray, drawn from the proposal field's weights.
 
-    A ray is cut into even intervals (see `Bounds.s_to_t`), the small field gives each a weight, and new intervals of equal
-    weight are cut; after the last cut they go to the large field. Its weights then teach the small one: wherever they are
-    larger than proposed, the proposal grows (mip-NeRF 360, Barron et al. 2022, sections 3.1 and 3.2). The small field is a
-    grid of logarithms of densities, on several levels that add up.
+    Intervals are even in s (see `Bounds.s_to_t`), then resampled twice by the proposal field's weights. The interlevel loss
+    trains the proposals to bound the main field's weights (mip-NeRF 360, Barron et al. 2022, sections 3.1 and 3.2). The
+    proposal field is a hash grid whose levels sum to a log-density.
 
     Args:
-        bounds: where the content is.
-        samples: on each ray, for the large field.
-        coarse_samples, fine_samples: intervals of the cuts before.
-        anneal: steps until proposals count in full; before, samples are spread more evenly.
-        histogram_padding: share of the samples that are spread evenly all the same.
-        num_levels, base_resolution, max_resolution, log2_hashmap_size: of the small field, see `HashGridField`.
-        lr_final_factor: what its learning rate falls to, besides the schedule. A small field that goes on learning
-            quickly follows every flicker of the large one, which then has no samples where plain surfaces really are.
+        bounds: the box of the content.
+        samples: samples per ray for the main field.
+        coarse_samples, fine_samples: intervals of the two proposal passes.
+        anneal: steps until the proposals apply in full; before, samples are spread more evenly.
+        histogram_padding: fraction of the samples that stays evenly spread.
+        num_levels, base_resolution, max_resolution, log2_hashmap_size: options of the hash grid, see `HashGridField`.
+        lr_final_factor: final learning-rate factor of the proposal field, on top of the schedule. If it keeps learning fast
+            it follows noise in the main field, which then gets no samples on textureless surfaces.
         chunk: see `Sampler`.
     """
 
@@ -53,7 +52,7 @@ class ProposalSampler(Sampler):
         base_resolution: GridSize = 32,
         max_resolution: GridSize = 128,
         log2_hashmap_size: Log2Size = 18,
-        lr_final_factor: Annotated[float, Gt(0), Le(1)] = 0.02,  # at 0 it would learn nothing after the first step
+        lr_final_factor: Annotated[float, Gt(0), Le(1)] = 0.02,  # 0 would stop it after the first step
         chunk: int = CHUNK,
     ):
         super().__init__(bounds, chunk)
@@ -65,7 +64,7 @@ class ProposalSampler(Sampler):
         self.grid = HashGrid(cubic_cells(num_levels, base_resolution, max_resolution), log2_hashmap_size, 1)
         self.unit_length = bounds.max_half_size
         self.first_step = 0
-        """The step at which training began."""
+        """First training step; annealing counts from it."""
         self.step = 0
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -79,17 +78,16 @@ class ProposalSampler(Sampler):
         count, device = len(rays), near.device
         s = torch.linspace(0, 1, self.coarse_samples + 1, device=device).expand(count, -1)
         if generator is not None:
-            s = torch.cat(
-                [s[:, :1], s[:, 1:-1] + self._jitter(rays, generator) / self.coarse_samples, s[:, -1:]], dim=1
-            )
+            jitter = self._jitter(rays, generator) / self.coarse_samples
+            s = torch.cat([s[:, :1], s[:, 1:-1] + jitter, s[:, -1:]], dim=1)
         histograms: list[Histogram] = []
-        for wanted in (self.fine_samples, self.samples):
+        for num_samples in (self.fine_samples, self.samples):
             with torch.set_grad_enabled(generator is not None):
                 histograms.append(Histogram(s, self.weights(rays, near, far, s)))
-            share = histograms[-1].weights.detach() + self.histogram_padding / s.shape[1]
+            pdf = histograms[-1].weights.detach() + self.histogram_padding / s.shape[1]
             if generator is not None:
-                share = share**self.anneal_exponent
-            s = resample(s, share, self._jitter(rays, generator)[:, 0], wanted)
+                pdf = pdf**self.anneal_exponent
+            s = resample(s, pdf, self._jitter(rays, generator)[:, 0], num_samples)
         _, t, dt = interval_midpoints(rays, self.bounds, near, far, s)
         ray = torch.arange(count, device=device).repeat_interleave(self.samples)
         offsets = torch.arange(count + 1, device=device) * self.samples
@@ -97,21 +95,21 @@ class ProposalSampler(Sampler):
         return Samples(t.flatten(), dt.flatten(), ray, offsets, proposals=proposals)
 
     def _jitter(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "R 1"]:
-        """By how much of an interval edges move, in -1/2 ... 1/2; not at all without a generator."""
+        """Shift of the edges in intervals, uniform in [-1/2, 1/2); zero without a generator."""
         if generator is None:
             return torch.zeros(len(rays), 1, device=rays.origins.device)
         return torch.rand(len(rays), 1, generator=generator, device=rays.origins.device) - 0.5
 
     @property
     def anneal_exponent(self) -> float:
-        """The power of the proposals: 0 spreads samples evenly, 1 follows them (mip-NeRF 360, section 3.2)."""
-        share = min(1.0, (self.step - self.first_step + 1) / max(self.anneal, 1))
-        return ANNEAL_SLOPE * share / ((ANNEAL_SLOPE - 1) * share + 1)
+        """Exponent of the proposal weights: 0 spreads samples evenly, 1 follows them (mip-NeRF 360, section 3.2)."""
+        progress = min(1.0, (self.step - self.first_step + 1) / max(self.anneal, 1))
+        return ANNEAL_SLOPE * progress / ((ANNEAL_SLOPE - 1) * progress + 1)
 
     def weights(
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]
     ) -> Float[Tensor, "R S"]:
-        """How much the small field thinks that each interval contributes to its ray's pixel, see `volume_weights`."""
+        """Rendering weights of the proposal field, see `volume_weights`."""
         unit, t, dt = interval_midpoints(rays, self.bounds, near, far, s)
         density = torch.exp(self.grid(unit).sum(1) + INIT_LOG_DENSITY)
         return interval_weights(density.view(t.shape) * (dt / self.unit_length))
@@ -120,8 +118,8 @@ class ProposalSampler(Sampler):
         if samples.proposals is None or weights is None:
             return {}
         histograms, edges = samples.proposals
-        found = weights.detach().view(len(edges), -1)
-        terms = [interlevel_loss(edges, found, histogram) for histogram in histograms]
+        main_weights = weights.detach().view(len(edges), -1)
+        terms = [interlevel_loss(edges, main_weights, histogram) for histogram in histograms]
         return {"interlevel": torch.stack(terms).sum()}
 
     @torch.no_grad()
@@ -136,22 +134,21 @@ class ProposalSampler(Sampler):
 def interlevel_loss(
     edges: Float[Tensor, "R K_plus_1"], weights: Float[Tensor, "R K"], proposed: Histogram
 ) -> Float[Tensor, ""]:
-    """How much weight was found where less was proposed: mip-NeRF 360, eq. 12 and 13, a mean over rays.
+    """Interlevel loss, mip-NeRF 360 eq. 12 and 13, mean over rays: penalizes weight above the proposal histogram's bound.
 
     Args:
-        edges, weights: of the intervals of the large field.
-        proposed: of the small one, with gradient.
+        edges, weights: intervals of the main field.
+        proposed: histogram of the proposal field, with gradient.
     """
     last = proposed.weights.shape[1]
     sums = torch.nn.functional.pad(proposed.weights.cumsum(1), (1, 0))
-    before = proposed.edges.contiguous()
-    low = (torch.searchsorted(before, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, last)
-    high = torch.searchsorted(before, edges[:, 1:].contiguous()).clamp(0, last)
+    proposed_edges = proposed.edges.contiguous()
+    low = (torch.searchsorted(proposed_edges, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, last)
+    high = torch.searchsorted(proposed_edges, edges[:, 1:].contiguous()).clamp(0, last)
     bound = sums.gather(1, high) - sums.gather(1, low)
     return ((weights - bound).clamp_min(0) ** 2 / (weights + 1e-5)).sum(1).mean()
 
 
 def choose_sampler(bounds: Bounds, chunk: int = CHUNK) -> Sampler:
-    """Proposals where every ray meets something, as before a background; where most of the space is empty, an occupancy grid,
-    which skips it."""
+    """Returns a proposal sampler for unbounded scenes, where every ray hits something; else an occupancy grid sampler."""
     return ProposalSampler(bounds, chunk=chunk) if bounds.unbounded else OccupancySampler(bounds, chunk=chunk)

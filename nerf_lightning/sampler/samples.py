@@ -1,4 +1,4 @@
-"""Samples: intervals along rays, packed one ray after the other, and the interface of all samplers."""
+"""Samples (packed intervals along rays) and the base class of samplers."""
 
 import bisect
 from collections.abc import Callable, Iterator
@@ -13,37 +13,36 @@ from nerf_lightning.cameras import BoundedModule, Bounds, Cameras, Rays
 from nerf_lightning.kernels import merge_low_weight, pack_intervals, ray_positions
 
 DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
-"""World positions -> density (1 / world unit); all that samplers know of a field."""
-
+"""World positions -> density (1 / world unit)."""
 
 CHUNK = 1 << 15
-"""Default of `Sampler`'s and `System`'s chunk."""
+"""Default `chunk` of `Sampler` and `System`."""
 SAMPLES_PER_RAY = 8
-"""That a ray takes about; most rays take few, or many that need little memory."""
+"""Typical number of samples per ray, which determines the ray chunk size."""
 MIN_SAMPLE_WEIGHT = 0.01
-"""Weight below which a sample of a picture takes its neighbour's colour: a quarter of Lego's at 800 pixels, for 0.001 dB."""
+"""Weight below which evaluation merges a sample with its neighbour: a quarter of Lego's at 800 pixels, for 0.001 dB."""
 
 
 class Histogram(NamedTuple):
     """Weights of intervals along rays."""
 
     edges: Float[Tensor, "R S_plus_1"]
-    """In [0, 1], see `Bounds.s_to_t`."""
+    """Interval edges in [0, 1], see `Bounds.s_to_t`."""
     weights: Float[Tensor, "R S"]
 
 
 class Proposals(NamedTuple):
-    """How a sampler came to as many samples on every ray."""
+    """Proposal histograms and the intervals drawn from them."""
 
     histograms: tuple[Histogram, ...]
-    """What it expected, with gradient."""
+    """Histogram of each proposal pass, with gradient."""
     edges: Float[Tensor, "R K_plus_1"]
-    """Of the samples, likewise in [0, 1]."""
+    """Edges of the samples, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """N intervals over R rays, sorted by ray, then by distance. Rays may hold different counts, or none."""
+    """N intervals on R rays, sorted by ray, then by distance. The count differs by ray and may be 0."""
 
     t: Float[Tensor, "N"]
     """Midpoint of each interval: distance along its ray."""
@@ -54,14 +53,14 @@ class Samples:
     offsets: Int[Tensor, "R_plus_1"]
     """Samples of ray r are offsets[r] : offsets[r + 1]."""
     complete: Bool[Tensor, "R"] | None = None
-    """Which rays have all their samples, if the number of samples was fixed before they were found: some rays may then lack
-    some, or intervals of length 0 fill the end. None: all rays have all."""
+    """With a fixed-size buffer, True for rays whose samples all fitted (unused slots hold intervals of length 0). None when
+    the count is exact."""
     cached_positions: Float[Tensor, "N 3"] | None = None
-    """World positions of the midpoints, if already known."""
+    """World positions of the midpoints, if already computed."""
     optical_depth: Float[Tensor, "N"] | None = None
-    """Optical thickness, density times length, if the sampler found it without randomness; it carries no gradient."""
+    """Optical depth (density times length) without gradient, if the sampler computed it without jitter."""
     proposals: Proposals | None = None
-    """What the sampler learns from in training, see `Sampler.loss`."""
+    """Proposals for `Sampler.losses`, in training."""
 
     def __len__(self) -> int:
         return self.t.shape[0]
@@ -77,30 +76,28 @@ class Samples:
         return rays.directions.detach().index_select(0, self.ray)
 
     def clip(self, near: float, far: float) -> "Samples":
-        """The samples whose midpoints lie between two distances along their rays."""
+        """Samples whose midpoints lie between two distances along their rays."""
         keep = (self.t >= near) & (self.t <= far)
         before = torch.cat([keep.new_zeros(1, dtype=torch.int64), keep.cumsum(0)])
         offsets = before[self.offsets].to(self.offsets.dtype)
         return self._take(keep, self.ray[keep], offsets)
 
     def _take(self, index: Tensor | slice, ray: Int[Tensor, "M"], offsets: Int[Tensor, "Q"]) -> "Samples":
-        """Some of the samples of a picture, which belong to these rays."""
+        """Selects evaluation samples; `ray` and `offsets` belong to the selection."""
         optical_depth = None if self.optical_depth is None else self.optical_depth[index]
         return Samples(self.t[index], self.dt[index], ray, offsets, optical_depth=optical_depth)
 
     def merge_low_weight_samples(self) -> "Samples":
-        """For pictures: fewer samples, those below `MIN_SAMPLE_WEIGHT` share a colour; as it is where thickness is not
-        known. The t of two that became one is where their weight is."""
+        """Merges neighbouring samples if one has less than `MIN_SAMPLE_WEIGHT`; no-op if the optical depth is unknown."""
         if self.optical_depth is None:
             return self
-        optical_depth, packed = merge_low_weight(
-            self.optical_depth, (self.t, self.dt, self.ray, self.offsets), MIN_SAMPLE_WEIGHT
-        )
+        packed = self.t, self.dt, self.ray, self.offsets
+        optical_depth, packed = merge_low_weight(self.optical_depth, packed, MIN_SAMPLE_WEIGHT)
         return Samples(*packed, optical_depth=optical_depth)
 
 
 def interval_weights(optical_depth: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
-    """How much each interval contributes to its ray's pixel, from its density times its length: see `volume_weights`."""
+    """Rendering weights from optical depths (density times length), see `volume_weights`."""
     return torch.exp(optical_depth - optical_depth.cumsum(1)) * -torch.expm1(-optical_depth)
 
 
@@ -110,10 +107,10 @@ def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Sampl
 
 
 def split_by_rays(samples: Samples, max_samples: int) -> Iterator[tuple[slice, Samples]]:
-    """Splits samples into runs of whole rays with at most `max_samples` samples each (a ray with more is a run of its own).
+    """Splits samples into chunks of whole rays with at most `max_samples` samples (a ray with more forms a chunk alone).
 
     Yields:
-        A run's rays as a slice, and their samples with `ray` and `offsets` counted from the run's start.
+        The chunk's rays as a slice, and their samples with `ray` and `offsets` relative to the chunk.
     """
     offsets = samples.offsets.tolist()
     first, rays = 0, len(offsets) - 1
@@ -126,15 +123,15 @@ def split_by_rays(samples: Samples, max_samples: int) -> Iterator[tuple[slice, S
 
 
 class Sampler(BoundedModule):
-    """Base of samplers. Without a generator (evaluation) the samples are not random.
+    """Base class of samplers. Without a generator (evaluation) samples are deterministic.
 
     Args:
-        bounds: where the content is.
-        chunk: samples that a device renders at a time; samplers work on multiples of it.
+        bounds: the box of the content.
+        chunk: samples rendered at a time; samplers work on multiples of it.
     """
 
     render_state: tuple[str, ...] = ()
-    """Names of what rendering needs of its state, for compact files."""
+    """State keys that rendering needs, for compact files."""
 
     def __init__(self, bounds: Bounds, chunk: int = CHUNK):
         super().__init__(bounds)
@@ -142,22 +139,22 @@ class Sampler(BoundedModule):
 
     @property
     def ray_chunk_size(self) -> int:
-        """Rays to sample together without gradient."""
+        """Rays sampled together in evaluation."""
         return max(1, self.chunk // SAMPLES_PER_RAY)
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups of what is learned at a rate of its own, each with a name."""
+        """Named parameter groups of the optimiser for the sampler's parameters."""
         return []
 
     def lr_factors(self, progress: float) -> dict[str, float]:
-        """Factors on the scheduled learning rate of these groups after this share of the training, by name."""
+        """Factors on the scheduled learning rate of these groups at this training progress, by name."""
         return {}
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         raise TypeError(f"{type(self).__name__} must define forward(rays, density, generator) -> Samples")
 
     def export_state(self) -> dict[str, Tensor]:
-        """What rendering needs, for `import_state`."""
+        """State that rendering needs, for `import_state`."""
         state = self.state_dict()
         return {name: state[name] for name in self.render_state}
 
@@ -170,26 +167,26 @@ class Sampler(BoundedModule):
         self.load_state_dict({name: state[name] for name in self.render_state}, strict=False)
 
     def warm_start_from(self, other: "Sampler") -> None:
-        """Copies what another sampler of the same kind and size has learned."""
+        """Copies the state of a sampler of the same kind and size."""
         self.load_state_dict(other.state_dict())
 
     def mark_invisible_cells(self, cameras: Cameras) -> None:
-        """Called before training with the photos' cameras, for samplers that skip what no camera sees."""
+        """Hook before training with the training cameras, for samplers that skip invisible cells."""
 
     def set_resolution_scale(self, scale: float) -> None:
-        """Called with the field's `resolution_scale`, for samplers whose steps follow it."""
+        """Hook with the field's `resolution_scale`, for samplers whose steps follow it."""
 
     def restart(self, step: int) -> None:
-        """Called when training starts again at a step, with a fresh field."""
+        """Hook when training restarts at a step with a fresh field."""
 
     def losses(self, samples: Samples, weights: Float[Tensor, "N"] | None) -> dict[str, Float[Tensor, ""]]:
-        """Losses by name from which the sampler learns.
+        """Losses of the sampler by name.
 
         Args:
-            samples: that it gave.
-            weights: how much each contributed to its ray's pixel, if known.
+            samples: output of `forward`.
+            weights: rendering weights of the main field, if known.
         """
         return {}
 
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
-        """Called before each training step, for samplers that learn where the content is."""
+        """Hook before each training step, for samplers that adapt to the content."""

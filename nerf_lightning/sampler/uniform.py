@@ -1,4 +1,4 @@
-"""Equal steps between near and far, with or without jitter, and then again where the weight is."""
+"""Uniform, stratified and importance sampling between near and far (NeRF, sections 4 and 5.2)."""
 
 import torch
 from jaxtyping import Float
@@ -11,7 +11,7 @@ from nerf_lightning.utils.option_checks import Count
 
 
 def stratified_edges(edges: Float[Tensor, "R S_plus_1"], generator: Generator) -> Float[Tensor, "R S_plus_1"]:
-    """Moves each inner edge to a random place between its neighbours' midpoints (NeRF, eq. 2); the ends stay."""
+    """Stratified jitter (NeRF, eq. 2): moves each inner edge within the adjacent midpoints; the ends stay."""
     middle = (edges[:, :-1] + edges[:, 1:]) / 2
     noise = torch.rand(middle[:, 1:].shape, generator=generator, device=edges.device)
     inner = middle[:, :-1] + (middle[:, 1:] - middle[:, :-1]) * noise
@@ -19,12 +19,12 @@ def stratified_edges(edges: Float[Tensor, "R S_plus_1"], generator: Generator) -
 
 
 class UniformSampler(Sampler):
-    """The same number of samples on every ray that meets the bounds.
+    """Uniform sampling with the same number of samples on every ray that hits the bounds.
 
     Args:
-        bounds: where the content is; rays that miss it get no samples.
+        bounds: the box of the content; rays that miss it get no samples.
         samples: intervals per ray.
-        stratified: jitter the intervals in training, so that over time the field is evaluated everywhere.
+        stratified: jitter the intervals in training.
         chunk: see `Sampler`.
     """
 
@@ -47,14 +47,12 @@ class UniformSampler(Sampler):
 
 
 class ImportanceSampler(UniformSampler):
-    """A uniform pass without gradient, then further samples drawn by its weights; returns both together.
-
-    One field serves both passes.
+    """Hierarchical sampling (NeRF, section 5.2) with one field: a uniform pass without gradient, then samples by its weights.
 
     Args:
-        bounds: where the content is.
-        samples: intervals of the first pass.
-        importance_samples: further samples per ray.
+        bounds: the box of the content.
+        samples: intervals of the coarse pass.
+        importance_samples: additional samples per ray; the output holds both.
         stratified: jitter both passes in training.
         chunk: see `Sampler`.
     """
@@ -78,10 +76,9 @@ class ImportanceSampler(UniformSampler):
             optical = torch.zeros(hit.shape[0], self.samples, device=edges.device)
             optical[hit[:, 0]] = (density(coarse.positions(rays)) * coarse.dt).view(-1, self.samples)
             weights = interval_weights(optical)
-        u = (torch.arange(self.importance_samples, device=edges.device) + 0.5).expand(
-            len(rays), -1
-        ) / self.importance_samples
+        count = self.importance_samples
+        u = (torch.arange(count, device=edges.device) + 0.5).expand(len(rays), -1) / count
         if self.stratified and generator is not None:
-            u = u + (torch.rand(u.shape, generator=generator, device=u.device) - 0.5) / self.importance_samples
+            u = u + (torch.rand(u.shape, generator=generator, device=u.device) - 0.5) / count
         merged = torch.cat([edges, invert_cdf(edges, weights, u)], dim=1).sort(dim=1).values
         return pack(merged, hit.expand(-1, merged.shape[1] - 1))

@@ -11,8 +11,8 @@ from nerf_lightning.utils.files import expand_user_path
 from nerf_lightning.utils.parsing import read_yaml
 
 Options = dict[str, Any]
-MIN_GAIN_RATIO = 3.0
-"""Growing continues while doubling the bytes gains `within_db / MIN_GAIN_RATIO`."""
+GAIN_DIVISOR = 3.0
+"""Growing continues while doubling the bytes gains `within_db / GAIN_DIVISOR`."""
 MAX_RUNGS_WITHOUT_GAIN = 2
 """Consecutive rungs without sufficient gain after which growing stops: one may be chance."""
 FULL_TRAINING_GAIN_DB = 1.0
@@ -80,7 +80,7 @@ def is_growth_finished(rungs: Sequence[RungResult], target: Target) -> bool:
         return False
     # Compare with the best earlier rung, not the previous one: a dip and recovery gains nothing.
     base = max(rungs[:-MAX_RUNGS_WITHOUT_GAIN], key=lambda rung: rung.psnr)
-    min_gain = target.within_db / MIN_GAIN_RATIO
+    min_gain = target.within_db / GAIN_DIVISOR
     return all(
         rung.psnr - base.psnr <= min_gain * max(math.log2(rung.size / base.size), 1.0)
         for rung in rungs[-MAX_RUNGS_WITHOUT_GAIN:]

@@ -1,1 +1,1 @@
-"""Synthetic scenes with exact geometry, for the stability suite, tests and benchmarks, and ways to corrupt them."""
+"""Synthetic scenes with exact geometry, and corruptions of scenes, for tests, benchmarks and the stability suite."""

@@ -1,4 +1,4 @@
-"""The built-in scene: a ray-traced bulldozer of bricks, so that a run needs no download."""
+"""The built-in scene: a ray-traced bulldozer of bricks, available without a download."""
 
 import logging
 import math
@@ -23,25 +23,23 @@ from nerf_lightning.utils.parsing import read_npz
 log = logging.getLogger(__name__)
 
 CACHE_VERSION = 1
-"""Part of the cached images' name: raise it whenever model, shading or cameras change."""
-CAMERA_RADIUS = 4.0311
-"""Distance of every camera from the origin, as in the NeRF paper's Lego scene."""
-FIELD_OF_VIEW_RAD = 0.6911112
-"""Horizontal; from the same scene."""
+"""Version in the cache's file names: increment it when model, shading or cameras change."""
+CAMERA_RADIUS, FIELD_OF_VIEW_RAD = 4.0311, 0.6911112
+"""Distance of the cameras from the origin, and their horizontal field of view, as in NeRF's Lego scene."""
 UP = (0.0, 0.0, 1.0)
 
 
 def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_views: int = 60) -> Scene:
-    """The bulldozer, seen by cameras like those of the NeRF paper's Lego scene; the same bytes on every run.
+    """The bulldozer scene, with cameras like those of NeRF's Lego scene; identical bytes on every run.
 
     Args:
         size: width and height of the images in pixels.
-        train_views: how many views to train on, spread over the upper hemisphere.
-        val_views: how many views to hold out, spread likewise, at other directions.
-        orbit_views: how many frames the circle around it has.
+        train_views: number of training views, spread over the upper hemisphere.
+        val_views: number of held-out views, spread likewise, at other directions.
+        orbit_views: number of frames of the orbit.
     """
-    what = f"{train_views + val_views:,} pictures of {size:,}x{size:,} pixels"
-    check_memory("bricks", "size, train_views, val_views", what, 4.0 * size**2 * (train_views + val_views))
+    contents = f"{train_views + val_views:,} pictures of {size:,}x{size:,} pixels"
+    check_memory("bricks", "size, train_views, val_views", contents, 4.0 * size**2 * (train_views + val_views))
     aabb = torch.from_numpy(load_bulldozer().aabb).float()
     centre = aabb.mean(0)
     orbit = make_circle_poses(torch.zeros(3), torch.tensor(UP), CAMERA_RADIUS, math.radians(30), orbit_views)
@@ -57,10 +55,10 @@ def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_v
 
 
 def _render_views(c2w: Float[Tensor, "V 4 4"], size: int, split: str) -> Views:
-    """Views of the bulldozer, from the cache where an earlier run has traced the same."""
+    """Renders views of the bulldozer, or reads them from the cache."""
     cameras = make_pinhole_cameras(c2w, size, size, FIELD_OF_VIEW_RAD)
     path = cache_folder() / f"bricks-v{CACHE_VERSION}-{size}px-{len(cameras)}-{split}.npz"
-    with suppress(InputError, KeyError):  # missing, or damaged: traced again
+    with suppress(InputError, KeyError):  # missing or damaged: render again
         images = read_npz(path, ["images"])["images"]
         if images.shape == (len(cameras), size, size, 4) and images.dtype == np.uint8:
             return Views.from_images(torch.from_numpy(images), cameras)
@@ -69,15 +67,15 @@ def _render_views(c2w: Float[Tensor, "V 4 4"], size: int, split: str) -> Views:
         with atomic_write(path) as temporary:
             np.savez_compressed(temporary, images=images)
     except (OSError, InputError) as error:
-        log.warning("the built-in scene is not cached, the next run traces it again: %s", error)
+        log.warning("cannot cache the built-in scene, the next run renders it again: %s", error)
     return Views.from_images(torch.from_numpy(images), cameras)
 
 
 def _hemisphere_poses(index: Tensor) -> Float[Tensor, "V 4 4"]:
-    """Poses on the upper hemisphere, evenly spread whatever their number; no two indices share one.
+    """Low-discrepancy poses on the upper hemisphere, distinct for distinct indices.
 
-    The R2 sequence: multiples of 1/g^2 and 1/g modulo 1, with g^3 = g + 1, fill the unit square; equal areas of it map
-    to equal areas of the sphere. The pole and the horizon are left out: there up is undefined, here the plate an edge.
+    The R2 sequence: multiples of 1/g^2 and 1/g modulo 1, with g^3 = g + 1, fill the unit square, which maps to the sphere
+    with equal areas. The pole, where up is undefined, and the horizon, which sees the plate edge-on, are excluded.
     """
     g = 1.324717957244746
     a, b = ((0.5 + index.double() / g**k) % 1 for k in (2, 1))

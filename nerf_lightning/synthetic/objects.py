@@ -1,7 +1,4 @@
-"""Small scenes with exact geometry: balls and blocks with a smooth pattern, ray traced in a fraction of a second.
-
-Any bodies on any background, unlike the tracer of the built-in scene, which renders one model with light and shadows.
-"""
+"""Ray-traced scenes of spheres and boxes with a smooth pattern, on any background, rendered in a fraction of a second."""
 
 import math
 from collections.abc import Sequence
@@ -16,11 +13,10 @@ from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
 
 CAMERA_DISTANCE = 4.0
-"""Of the cameras from the origin, world units."""
-FIELD_OF_VIEW_RAD = 0.7
-"""Horizontal."""
+"""Distance of the cameras from the origin, world units."""
+FIELD_OF_VIEW_RAD = 0.7  # horizontal
 LIGHT_DIRECTION = (0.5, -0.4, 0.77)
-"""Direction towards the light, nearly unit."""
+"""Direction toward the light, nearly unit length."""
 
 Point = tuple[float, float, float]
 
@@ -32,10 +28,10 @@ class Sphere:
     centre: Point
     radius: float
     frequency: float = 1.0
-    """Fineness of the pattern, see `shade`."""
+    """Spatial frequency of the pattern, see `shade`."""
 
     def intersect(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R 3"]]:
-        """Distance along each ray to the surface (infinite where it misses) and the outward normal there."""
+        """Distance along each ray to the surface (inf if it misses) and the outward normal there."""
         offset = rays.origins - torch.tensor(self.centre)
         half = (offset * rays.directions).sum(1)
         inside = half**2 - (offset * offset).sum(1) + self.radius**2
@@ -52,20 +48,20 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Box:
-    """A box along the axes, world units."""
+    """An axis-aligned box, world units."""
 
     low: Point
     high: Point
     frequency: float = 1.0
 
     def intersect(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R 3"]]:
-        """As `Sphere.intersect`."""
+        """Distance and outward normal, see `Sphere.intersect`."""
         low, high = self.aabb
         first = (low - rays.origins) / rays.directions
         second = (high - rays.origins) / rays.directions
-        enters, axis = torch.minimum(first, second).max(1)
-        leaves = torch.maximum(first, second).min(1).values
-        t = torch.where((leaves > enters) & (enters > 0), enters, math.inf)
+        t_enter, axis = torch.minimum(first, second).max(1)
+        t_exit = torch.maximum(first, second).min(1).values
+        t = torch.where((t_exit > t_enter) & (t_enter > 0), t_enter, math.inf)
         normals = torch.nn.functional.one_hot(axis, 3).to(t.dtype) * -rays.directions.sign()
         return t, normals
 
@@ -80,7 +76,7 @@ Primitive = Sphere | Box
 def shade(
     points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], frequency: Float[Tensor, "N 1"]
 ) -> Float[Tensor, "N 3"]:
-    """Colour of a surface: three waves, lit from one side; finer with larger `frequency`, plain for 0."""
+    """Surface colour: three sine waves scaled by `frequency` (constant for 0), with Lambertian shading."""
     waves = torch.tensor([[5.0, 2.0, 1.0], [-2.0, 6.0, 3.0], [1.0, -3.0, 7.0]])
     colour = 0.5 + 0.35 * torch.sin(frequency * points @ waves.T + torch.tensor([0.0, 1.0, 2.0]))
     light = (normals @ torch.tensor(LIGHT_DIRECTION)).clamp_min(0)
@@ -90,7 +86,7 @@ def shade(
 def trace_rays(
     primitives: Sequence[Primitive], rays: Rays
 ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Int[Tensor, "R"]]:
-    """Colour, distance and index of the first body along each ray: black, infinite and 0 where there is none."""
+    """Colour, distance and index of the first primitive along each ray: black, inf and 0 if there is none."""
     distance, normals = torch.full((len(rays),), math.inf), torch.zeros(len(rays), 3)
     index = torch.zeros(len(rays), dtype=torch.long)
     for i, primitive in enumerate(primitives):
@@ -106,7 +102,7 @@ def trace_rays(
 def render_photos(
     primitives: Sequence[Primitive], cameras: Cameras, background: Point | None, samples: int = 3
 ) -> UInt8[Tensor, "V H W C"]:
-    """Photos on a background, or with alpha where it is None; the mean over `samples` x `samples` rays a pixel."""
+    """Renders photos on a background, or with alpha if it is None; `samples` x `samples` rays per pixel."""
     fine = cameras.rescale(samples)
     photos = []
     for view in range(len(cameras)):
@@ -123,9 +119,9 @@ def render_photos(
 
 
 def make_hemisphere_cameras(count: int, size: int, phase: float = 0.0, distance: float = CAMERA_DISTANCE) -> Cameras:
-    """Cameras spread over the upper part of a sphere, looking at the origin; `phase` rotates them about z.
+    """Cameras on a Fibonacci lattice of the upper hemisphere, looking at the origin; `phase` rotates them about z.
 
-    Equal steps in height are equal areas of the sphere; the golden angle between neighbours keeps them apart.
+    Equal steps in height are equal areas of the sphere; consecutive azimuths differ by the golden angle.
     """
     index = torch.arange(count, dtype=torch.float64) + 0.5
     z = 0.05 + 0.85 * index / count
@@ -137,14 +133,14 @@ def make_hemisphere_cameras(count: int, size: int, phase: float = 0.0, distance:
 
 
 def make_pinhole_cameras(c2w: Float[Tensor, "V 4 4"], width: int, height: int, field_of_view_rad: float) -> Cameras:
-    """Pinhole cameras of one horizontal field of view."""
+    """Pinhole cameras with a common horizontal field of view."""
     focal = 0.5 * width / math.tan(0.5 * field_of_view_rad)
     K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Cameras.pinhole(K.repeat(len(c2w), 1, 1), c2w, width, height)
 
 
 def bound_primitives(primitives: Sequence[Primitive]) -> Bounds:
-    """The box around bodies, a tenth larger."""
+    """Bounds of primitives, enlarged by 10 %."""
     boxes = torch.stack([primitive.aabb for primitive in primitives])
     low, high = boxes[:, 0].amin(0), boxes[:, 1].amax(0)
     centre, half = (low + high) / 2, (high - low) / 2
@@ -158,7 +154,7 @@ def make_object_scene(
     views: int = 24,
     held_out: int = 4,
 ) -> Scene:
-    """A scene of bodies around the origin, with exact cameras and bounds.
+    """A scene of primitives around the origin, with exact cameras and bounds.
 
     Args:
         primitives: within about 1 of the origin.
@@ -184,8 +180,8 @@ PILE: list[Primitive] = [
     Box((-0.8, 0.2, -0.4), (-0.2, 0.8, 0.3)),
     Box((-0.9, -0.9, -0.6), (0.9, 0.9, -0.4)),
 ]
-"""The scene of most conditions."""
+"""Default scene of the stability suite."""
 MARBLE: list[Primitive] = [Sphere((0.0, 0.0, 0.0), 0.3)]
-"""Small: three percent of a photo."""
+"""A small subject: three percent of a photo."""
 ROD: list[Primitive] = [Box((-0.02, -0.02, -0.8), (0.02, 0.02, 0.8)), Box((-0.6, -0.6, -0.9), (0.6, 0.6, -0.8))]
-"""Thinner than a pixel, on a plate."""
+"""A rod thinner than a pixel, on a plate."""

@@ -1,4 +1,4 @@
-"""The ray tracer of boxes and cylinders: exact colour, alpha and depth of the bulldozer."""
+"""Ray tracer of the bulldozer: exact colour, alpha and depth."""
 
 import functools
 from typing import NamedTuple
@@ -11,18 +11,17 @@ from nerf_lightning.cameras import Cameras, look_at
 from nerf_lightning.kernels.cpu import solids as fast
 from nerf_lightning.synthetic.solids import Solids, load_bulldozer
 
-SUPERSAMPLING = 3
-"""Samples a pixel along each side."""
+SUPERSAMPLING = 3  # samples along each side of a pixel
 SHADOW_MAP_SIZE_PX = 1536
 
 
 def rasterize(solids: Solids, cameras: Cameras, view: int) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """The solid seen at each pixel centre of a view (-1 for none) and its depth along the camera's z axis (inf for none).
+    """Index of the first solid at each pixel centre (-1 for none) and its depth along the camera's z axis (inf for none).
 
-    Each solid is intersected only where its bounding box projects to; all of it must lie before the camera.
+    Each solid is intersected only within its projected bounding box; all of it must lie in front of the camera.
     """
     K, c2w = (matrix[view].double().numpy() for matrix in (cameras.K, cameras.c2w))
-    # A solid's own frame sees pixel (u, v) along lift @ (u, v, 1), so that rows and columns just add up.
+    # In a solid's frame pixel (u, v) has direction lift @ (u, v, 1): linear in rows and columns.
     lift = (solids.to_unit @ c2w[:3, :3] @ np.linalg.inv(K)).astype(np.float32)
     eye = np.einsum("pij,pj->pi", solids.to_unit, c2w[:3, 3] - solids.centre).astype(np.float32)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
@@ -38,7 +37,7 @@ def rasterize(solids: Solids, cameras: Cameras, view: int) -> tuple[Int[np.ndarr
 
 
 class ShadowMap(NamedTuple):
-    """What the key light sees."""
+    """First solid and depth as seen from the key light."""
 
     rotation: Float[np.ndarray, "3 3"]
     focal: float
@@ -48,10 +47,9 @@ class ShadowMap(NamedTuple):
 
 @functools.cache
 def render_shadow_map() -> ShadowMap:
-    """The bulldozer's shadow map."""
-    light, reach = np.array(fast.LIGHT_POSITION, float), float(np.linalg.norm(load_bulldozer().aabb, axis=1).max())
+    light, radius = np.array(fast.LIGHT_POSITION, float), float(np.linalg.norm(load_bulldozer().aabb, axis=1).max())
     c2w = look_at(torch.from_numpy(light).float(), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
-    focal = SHADOW_MAP_SIZE_PX / 2 * float(np.sqrt(light @ light - reach**2)) / reach
+    focal = SHADOW_MAP_SIZE_PX / 2 * float(np.sqrt(light @ light - radius**2)) / radius
     centre = SHADOW_MAP_SIZE_PX / 2
     K = torch.tensor([[focal, 0, centre], [0, focal, centre], [0, 0, 1]])
     cameras = Cameras.pinhole(K[None], c2w[None], SHADOW_MAP_SIZE_PX, SHADOW_MAP_SIZE_PX)
@@ -59,7 +57,7 @@ def render_shadow_map() -> ShadowMap:
 
 
 def render_view(cameras: Cameras, view: int) -> UInt8[np.ndarray, "H W 4"]:
-    """One view of the bulldozer: sRGB and straight alpha, each pixel the mean of a grid of samples."""
+    """Renders a view of the bulldozer: sRGB and straight alpha, supersampled."""
     fine, solids = cameras.rescale(SUPERSAMPLING), load_bulldozer()
     rgba = np.zeros((cameras.height, cameras.width, 4), np.uint8)
     K, c2w = fine.K[view].numpy(), fine.c2w[view].numpy()

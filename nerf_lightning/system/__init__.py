@@ -1,4 +1,4 @@
-"""Stage 6, systems: LightningModules that hold step, loss, metrics and optimiser, and nothing else."""
+"""LightningModules: training step, losses, metrics and optimiser of NeRF2D and NeRF3D."""
 
 from nerf_lightning.system.metrics import mse_to_psnr, psnr, ssim
 from nerf_lightning.system.nerf2d import NeRF2D

@@ -1,9 +1,8 @@
-"""Trials of `refine=auto`: whether a least-squares step on some pixels of each photo lowers the error on others.
+"""Correction trials of `refine=auto`: does one least-squares update, fitted to some pixels, lower the error on others?
 
-An L2 prior on corrections that are always on does not do as well. TensoRF after 300 steps of small scenes, median of three
-seeds: exact cameras lose nothing by trials, 0.9 dB without prior or trials, 0.5 and 0.2 dB with 1e-4 and 1e-3 of the mean
-squared motion in pixels added to the loss; cameras off by 0.5 degrees end 0.4 and 0.6 dB below trials with these, and 2.8 dB
-with 1e-2.
+An L2 prior on corrections that are always on does worse. TensoRF after 300 steps on small scenes, median of three seeds: with
+exact cameras trials cost nothing, no prior and no trials 0.9 dB, priors of 1e-4 and 1e-3 of the mean squared motion in pixels
+0.5 and 0.2 dB; with cameras off by 0.5 degrees, these priors end 0.4 and 0.6 dB below trials, and one of 1e-2 2.8 dB.
 """
 
 import copy
@@ -30,21 +29,20 @@ if TYPE_CHECKING:
     from nerf_lightning.system.nerf3d import NeRF3D
 
 FIRST_TRIAL_STEP, MAX_TRIAL_PROGRESS = 24, 0.4
-"""The step of the first trial, with each next one at twice the step of the one before; and the share of the training that they
-end with. Large faults show while the field is smooth, as later it has explained them by fog; small ones when it is sharp."""
+"""Step of the first trial, each later one at twice the step, and training progress after which there are none. Large pose
+errors show while the field is smooth, as later it has explained them by fog; small ones once it is sharp."""
 EARLY_TRIAL_STEPS, EARLY_REDUCTION_FACTOR = 64, 2
-"""Steps before which gains are not tried, as a field that is still too dark everywhere wants gains; and how many times as much
-poses have to explain before: a field that is still blurred follows any motion a little."""
+"""Before this step gains are not tried, as a field that is still dark asks for gains, and poses need this multiple of their
+error reduction: a blurred field follows any motion a little."""
 MIN_ERROR_REDUCTION = {"poses": 0.01, "exposure": 0.05}
-"""Share by which most photos' squared error has to fall. Exact poses raise it; gains explain a little of all that is wrong, and
-make the neutral look another than that of the photos."""
+"""Relative reduction of most photos' squared error that enables a correction. Exact poses raise the error; gains explain a
+little of any error, and shift the photos' neutral colour."""
 RETEST_FRACTION, NUM_DRAWS = 0.5, 4
-"""Share of `MIN_ERROR_REDUCTION` from which on this many draws of pixels decide, by their mean."""
+"""Above this fraction of `MIN_ERROR_REDUCTION` a trial is repeated; the mean of this many pixel draws decides."""
 MAX_PHOTOS, PIXELS_PER_PHOTO = 64, 128
-"""How many photos are looked at, and pixels of each that decide; as many others judge."""
+"""Photos per trial, and pixels fitted in each; equally many are tested."""
 LM_DAMPING, MIN_LM_DAMPING = 0.3, 1e-6
-"""Shares of each unknown's own effect, and of the mean over a photo's unknowns as some have none, that are added to the normal
-equations (Levenberg and Marquardt)."""
+"""Levenberg-Marquardt damping, relative to each diagonal entry of the normal equations and to their mean over a photo."""
 POSES, EXPOSURE = slice(0, 6), slice(6, 9)
 """Columns of the unknowns: a camera's `pose_adjustment`, then its `log_gains`."""
 RenderFn = Callable[[Rays, Float[Tensor, "R 3"]], RenderOutput]
@@ -59,7 +57,7 @@ class PhotoPixels(NamedTuple):
     truth: Float[Tensor, "VP 3"]
     backgrounds: Float[Tensor, "VP 3"]
     known: Bool[Tensor, "VP"]
-    """Whether they count."""
+    """False where masked."""
 
 
 def sample_photo_pixels(
@@ -70,7 +68,7 @@ def sample_photo_pixels(
     generator: Generator,
     column_range: tuple[float, float] = (0.0, 1.0),
 ) -> PhotoPixels:
-    """Random pixels of some photos, as many of each, drawn with replacement from these shares of their columns."""
+    """Random pixels of each photo, drawn with replacement from a range of columns (fractions of the width)."""
     index = torch.tensor(photos, device=background.device)
     down, across = torch.rand(2, len(photos), num_pixels, generator=generator, device=background.device)
     width = views.widths[index, None]
@@ -86,7 +84,7 @@ def sample_photo_pixels(
 
 @torch.no_grad()
 def render_photo_pixels(render: RenderFn, corrections: Corrections | None, pixels: PhotoPixels) -> RenderOutput:
-    """What cameras see through these pixels, as corrected if they are."""
+    """Renders the pixels, through corrected cameras if `corrections` is given."""
     rays = pixels.rays if corrections is None else corrections.poses(pixels.rays, pixels.views)
     return render(rays, pixels.backgrounds)
 
@@ -95,7 +93,7 @@ def render_photo_pixels(render: RenderFn, corrections: Corrections | None, pixel
 def compute_squared_errors(
     output: RenderOutput, corrections: Corrections | None, pixels: PhotoPixels, num_photos: int
 ) -> Float[Tensor, "V"]:
-    """Of each photo: the sum over its known pixels and their channels, in corrected light if it is."""
+    """Squared error of each photo, summed over known pixels and channels, with corrected colours if given."""
     rgb = output.rgb
     if corrections is not None:
         rgb = corrections.color(rgb, output.opacity, pixels.backgrounds, pixels.rays, pixels.views)
@@ -105,8 +103,8 @@ def compute_squared_errors(
 def compute_residual_jacobian(
     render: RenderFn, corrections: Corrections, pixels: PhotoPixels, num_photos: int
 ) -> tuple[Float[Tensor, "V P 1"], Float[Tensor, "V P 9"]]:
-    """What is left to explain of one channel of each pixel, red, green and blue in turn, and how it follows its photo's
-    `pose_adjustment` and `log_gains`. All three channels would cost three times the gradient and say little more."""
+    """Residuals of one channel per pixel (R, G, B in turn), and their Jacobian in `pose_adjustment` and `log_gains`. All three
+    channels would cost three times the gradient and add little."""
     with torch.no_grad():
         rays = corrections.poses(pixels.rays, pixels.views)
     origins, directions = (x.detach().requires_grad_() for x in (rays.origins, rays.directions))
@@ -118,30 +116,30 @@ def compute_residual_jacobian(
     with torch.no_grad():
         rotations = torch.linalg.cross(directions, rotations, dim=1)
         scales = corrections.poses.preconditioner.index_select(0, pixels.views)
-        by_motion = torch.cat([rotations, translations], dim=1)[:, None] @ scales
+        pose_jacobian = torch.cat([rotations, translations], dim=1)[:, None] @ scales
         foreground = rgb - (1 - output.opacity)[:, None] * pixels.backgrounds
-        by_gain = torch.zeros_like(foreground).scatter(1, channel, foreground.gather(1, channel))
-        counted = pixels.known[:, None].float()
-        jacobian = torch.cat([by_motion[:, 0], by_gain], dim=1) * counted
-        residuals = (pixels.truth - rgb).gather(1, channel) * counted
+        gain_jacobian = torch.zeros_like(foreground).scatter(1, channel, foreground.gather(1, channel))
+        valid = pixels.known[:, None].float()
+        jacobian = torch.cat([pose_jacobian[:, 0], gain_jacobian], dim=1) * valid
+        residuals = (pixels.truth - rgb).gather(1, channel) * valid
         return residuals.view(num_photos, -1, 1), jacobian.view(num_photos, -1, 9)
 
 
 def solve_damped_least_squares(
     residuals: Float[Tensor, "V N 1"], jacobian: Float[Tensor, "V N K"]
 ) -> Float[Tensor, "V K"]:
-    """Of each photo, the change of its K unknowns that explains most of what is left."""
-    square = jacobian.mT @ jacobian
-    own = square.diagonal(dim1=1, dim2=2)
-    damping = LM_DAMPING * own + MIN_LM_DAMPING * own.mean(1, keepdim=True) + torch.finfo(own.dtype).tiny ** 0.5
-    return torch.linalg.solve(square + torch.diag_embed(damping), jacobian.mT @ residuals)[..., 0]
+    """Levenberg-Marquardt update of each photo's K unknowns."""
+    normal_matrix = jacobian.mT @ jacobian
+    diag = normal_matrix.diagonal(dim1=1, dim2=2)
+    damping = LM_DAMPING * diag + MIN_LM_DAMPING * diag.mean(1, keepdim=True) + torch.finfo(diag.dtype).tiny ** 0.5
+    return torch.linalg.solve(normal_matrix + torch.diag_embed(damping), jacobian.mT @ residuals)[..., 0]
 
 
 @torch.no_grad()
 def apply_update(
     corrections: Corrections, photos: Sequence[int], pose_adjustment: Tensor | None, log_gains: Tensor | None
 ) -> Corrections:
-    """A copy of corrections with these changes of some photos, but for what those have in common."""
+    """Copies the corrections and updates some photos, with gauge modes and mean gain projected out."""
     trial = copy.deepcopy(corrections)
     if pose_adjustment is not None:
         trial.poses.pose_adjustment.requires_grad_(True)
@@ -161,17 +159,18 @@ def measure_error_reductions(
     generator: Generator,
     exposure: bool = True,
 ) -> dict[str, float]:
-    """By what share of itself a photo's squared error falls on pixels that did not decide, if a field that stays as it is may
-    be seen by corrected cameras ("poses") and exposure ("exposure"), each with or without the other, or in light by the
-    stated exposures alone ("exif"): the median over photos, since a few in which something moved say nothing of the others.
+    """Relative reduction of test pixels' squared error by one update with the field frozen, median over photos.
+
+    Of "poses" and "exposure", each with or without the other, and of the stated exposures alone ("exif"). The median, since a
+    few photos in which something moved say nothing about the others.
 
     Args:
-        render: of the field.
+        render: renders the field.
         views: the training photos.
         background: the colour behind the scene.
-        corrections: those that there are already; they are not changed.
-        generator: of the pixels.
-        exposure: whether to ask about exposure too; poses alone take less time.
+        corrections: current corrections; not changed.
+        generator: draws the pixels.
+        exposure: also measures exposure; poses alone are faster.
     """
     photos = subsample(len(views), MAX_PHOTOS)
     fit_pixels, test_pixels = (
@@ -181,28 +180,28 @@ def measure_error_reductions(
 
     def errors(pose_adjustment: Tensor | None, log_gains: Tensor | None) -> Float[Tensor, "V"]:
         trial = apply_update(corrections, photos, pose_adjustment, log_gains)
-        output = unmoved if pose_adjustment is None else render_photo_pixels(render, trial, test_pixels)
+        output = baseline_output if pose_adjustment is None else render_photo_pixels(render, trial, test_pixels)
         return compute_squared_errors(output, trial, test_pixels, len(photos))
 
-    unmoved = render_photo_pixels(render, corrections, test_pixels)
-    unchanged = errors(None, None)
+    baseline_output = render_photo_pixels(render, corrections, test_pixels)
+    baseline = errors(None, None)
     only_poses = errors(solve_damped_least_squares(residuals, jacobian[..., POSES]), None)
-    decreases = {"poses": unchanged - only_poses}
+    decreases = {"poses": baseline - only_poses}
     if exposure:
-        both = solve_damped_least_squares(residuals, jacobian)
-        corrected = errors(both[:, POSES], both[:, EXPOSURE])
+        joint = solve_damped_least_squares(residuals, jacobian)
+        poses_and_exposure = errors(joint[:, POSES], joint[:, EXPOSURE])
         only_exposure = errors(None, solve_damped_least_squares(residuals, jacobian[..., EXPOSURE]))
         decreases = {
-            "poses": torch.minimum(unchanged, only_exposure) - torch.minimum(only_poses, corrected),
-            "exposure": torch.minimum(unchanged, only_poses) - torch.minimum(only_exposure, corrected),
-            "exif": unchanged - errors(None, corrections.color.exif_log_gains[photos]),
+            "poses": torch.minimum(baseline, only_exposure) - torch.minimum(only_poses, poses_and_exposure),
+            "exposure": torch.minimum(baseline, only_poses) - torch.minimum(only_exposure, poses_and_exposure),
+            "exif": baseline - errors(None, corrections.color.exif_log_gains[photos]),
         }
-    fractions = {name: by / unchanged for name, by in decreases.items()}  # nan where all is masked
+    fractions = {name: decrease / baseline for name, decrease in decreases.items()}  # nan where all is masked
     return {name: float(fraction.nanmedian().nan_to_num()) for name, fraction in fractions.items()}
 
 
 def freeze_renderer(system: "NeRF3D") -> RenderFn:
-    """Renders without randomness and with gradient in the rays alone: the field does not learn from it."""
+    """Renders copies of field and renderer without randomness; only the rays get gradients."""
     field, renderer = copy.deepcopy(system.field).requires_grad_(False), copy.deepcopy(system.renderer).eval()
 
     def render(rays: Rays, background: Tensor) -> RenderOutput:
@@ -214,27 +213,25 @@ def freeze_renderer(system: "NeRF3D") -> RenderFn:
 
 
 def list_candidates(corrections: Corrections, step: int, progress: float) -> list[str]:
-    """What a trial at this step is to decide on; none where no trial is due."""
+    """Corrections that a trial at this step decides on; empty if no trial is due."""
     doublings, rest = divmod(step, FIRST_TRIAL_STEP)
     is_trial_step = step > 0 and not rest and not doublings & (doublings - 1) and progress <= MAX_TRIAL_PROGRESS
     if not corrections.auto or not is_trial_step:
         return []
-    names = (
-        corrections.learning_rates if step >= EARLY_TRIAL_STEPS else corrections.learning_rates.keys() - {"exposure"}
-    )
-    return [name for name in names if name not in corrections.enabled_at]
+    skipped = {"exposure"} if step < EARLY_TRIAL_STEPS else set()
+    return [name for name in corrections.learning_rates if name not in corrections.enabled_at.keys() | skipped]
 
 
 def select_corrections(
     candidates: Sequence[str], step: int, reductions: dict[str, float], fraction: float = 1.0
 ) -> list[str]:
-    """What helps by a trial at this step that said this; or might, as it explains this share of what it has to."""
+    """Candidates whose error reduction exceeds `fraction` of their threshold."""
     factor = fraction * (EARLY_REDUCTION_FACTOR if step < EARLY_TRIAL_STEPS else 1)
     return [name for name in candidates if reductions[name] > factor * MIN_ERROR_REDUCTION[name]]
 
 
 class CorrectionTrials(L.Callback):
-    """Corrects cameras and light from the first trial on that shows that it helps; where it might, more pixels are asked."""
+    """Runs the trials of `refine=auto` and enables corrections that help; inconclusive trials are repeated."""
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: "NeRF3D", batch: Any, batch_idx: int) -> None:
         corrections, step, progress = pl_module.corrections, trainer.global_step, pl_module.state.progress
@@ -248,8 +245,8 @@ class CorrectionTrials(L.Callback):
         )
         reductions = measure()
         if select_corrections(candidates, step, reductions, RETEST_FRACTION):
-            several = [reductions, *(measure() for _ in range(NUM_DRAWS - 1))]
-            reductions = {name: fmean(one[name] for one in several) for name in reductions}
+            draws = [reductions, *(measure() for _ in range(NUM_DRAWS - 1))]
+            reductions = {name: fmean(draw[name] for draw in draws) for name in reductions}
         selected = select_corrections(candidates, step, reductions)
         corrections.record_trial(
             progress, selected, {name: reductions[name] for name in candidates}, reductions.get("exif", 0.0) > 0

@@ -1,4 +1,4 @@
-"""Growth of the field during training: coarse grids find the shape sooner, fine ones hold the detail."""
+"""Field growth during training: coarse grids find the shape sooner, fine ones hold the detail."""
 
 import copy
 from typing import TYPE_CHECKING
@@ -16,10 +16,9 @@ if TYPE_CHECKING:
 
 
 def compute_next_stage(system: "NeRF3D", step: int) -> int | None:
-    """The stage that the field is to take at this step; None if it keeps the one it has.
+    """Growth stage due at this step; None if the field keeps its stage.
 
-    It follows the progress, but for few or many steps (see `ResolutionSchedule.clamp_progress`), and is slower while corrected
-    cameras find their places.
+    Follows progress, clamped for few or many steps (see `ResolutionSchedule.clamp_progress`) and delayed by pose refinement.
     """
     growth, progress, corrections = system.field.growth, system.state.progress, system.corrections
     if growth is None:
@@ -31,31 +30,31 @@ def compute_next_stage(system: "NeRF3D", step: int) -> int | None:
 
 
 def sync_resolution_scale(system: "NeRF3D", data: RayDataModule) -> None:
-    """Gives the sampler's steps, and the samples a step of the data, the field's present resolution."""
+    """Passes the field's resolution scale on to the sampler's step size and the data's samples per step."""
     system.sampler.set_resolution_scale(system.field.resolution_scale)
     data.set_resolution_scale(system.field.resolution_scale)
 
 
 @torch.no_grad()
 def upsample_field(system: "NeRF3D", data: RayDataModule, stage: int, optimizer: torch.optim.Optimizer) -> None:
-    """Upsamples the field; the optimiser forgets its state for what has another shape."""
+    """Upsamples the field and drops the optimiser state of resized parameters."""
     for parameter in system.field.upsample(stage):
         optimizer.state.pop(parameter, None)
     sync_resolution_scale(system, data)
 
 
 class FieldGrowth(L.Callback):
-    """Upsamples a field that grows when its next stage is due."""
+    """Upsamples the field when its next stage is due."""
 
     def on_train_batch_start(self, trainer: L.Trainer, pl_module: "NeRF3D", batch: RayBatch, batch_idx: int) -> None:
         stage = compute_next_stage(pl_module, trainer.global_step)
         if stage is None:
             return
-        if trainer.world_size > 1:  # each process has seen rays of its own, and all must grow alike
+        if trainer.world_size > 1:  # each process saw different rays, but all must grow alike
             for buffer in pl_module.buffers():
                 torch.distributed.broadcast(buffer, 0)
         upsample_field(pl_module, pl_module.datamodule, stage, trainer.optimizers[0])
-        if isinstance(trainer.strategy, DDPStrategy):  # it has allocated gradients of the old size
+        if isinstance(trainer.strategy, DDPStrategy):  # its gradient buckets have the old size
             trainer.strategy.model = pl_module
             trainer.strategy.configure_ddp()
         if pl_module.compile_backend is not None:
@@ -63,7 +62,7 @@ class FieldGrowth(L.Callback):
 
 
 def warm_up_compile(system: "NeRF3D", batch: RayBatch) -> None:
-    """Runs a step on a copy with the clock stopped: compiling for a new size does not count as training."""
+    """Runs a step on a copy with the clock paused: compiling for a new size does not count as training."""
     field, sampler = copy.deepcopy(system.field), copy.deepcopy(system.sampler)
     options = (
         system.make_optimizer,

@@ -1,4 +1,4 @@
-"""How good a picture is."""
+"""Image metrics: PSNR and SSIM."""
 
 import math
 
@@ -8,19 +8,18 @@ from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
 PSNR_CHUNK_PIXELS = 1 << 18
-"""Pixels compared at once: in doubles, a large picture would take gigabytes."""
+"""Pixels per chunk: a large image in float64 would take gigabytes."""
 
 
 def mse_to_psnr(mse: float) -> float:
-    """10 log10(1 / MSE), at most 120 dB."""
+    """PSNR in dB, 10 log10(1 / MSE), at most 120."""
     return -10 * math.log10(max(mse, 1e-12))
 
 
 def psnr(
     image: Float[Tensor, "*shape C"], truth: Float[Tensor, "*shape C"], known: Bool[Tensor, "*shape"] | None = None
 ) -> float:
-    """Peak signal-to-noise ratio in dB, 10 log10(1 / MSE), of pictures in [0, 1], over all pixels or the known ones; nan where
-    none is known."""
+    """PSNR in dB of images in [0, 1], over all or the known pixels; nan if none is known."""
     first, second = (x.reshape(-1, x.shape[-1]).cpu().split(PSNR_CHUNK_PIXELS) for x in (image, truth))
     masks = [...] * len(first) if known is None else known.reshape(-1).cpu().split(PSNR_CHUNK_PIXELS)
     squared_errors = count = 0.0
@@ -31,9 +30,9 @@ def psnr(
 
 
 SSIM_WINDOW = 11
-"""Pixels along a side of the window that torchmetrics uses with its default Gaussian of 1.5 pixels."""
+"""Side of the window in pixels: torchmetrics' default for a Gaussian of 1.5 pixels."""
 SSIM_CHUNK_ROWS = 32
-"""Rows compared at once: the library needs a kilobyte for each pixel."""
+"""Rows per chunk: torchmetrics needs a kilobyte per pixel."""
 
 
 def ssim(
@@ -42,27 +41,27 @@ def ssim(
     known: Bool[Tensor, "H W"] | None = None,
     strip: int | None = None,
 ) -> float:
-    """Structural similarity (Wang et al. 2004) of pictures in [0, 1]; nan if they are smaller than its window.
+    """Structural similarity (Wang et al. 2004) of images in [0, 1]; nan if they are smaller than the window.
 
-    Where only some pixels are known, it is the mean over windows around these; what is not known counts as equal in them.
+    With a mask, the mean over windows around known pixels, in which unknown pixels count as equal.
 
     Args:
         image, truth: to compare.
-        known: which pixels count; None for all.
-        strip: rows that belong together; each such strip is compared as a picture of its own. None: all do.
+        known: pixels that count; None for all.
+        strip: rows per strip, each compared as an image of its own; None: one strip.
     """
     height, width, _ = image.shape
     if min(height, width, strip or height) < SSIM_WINDOW:
         return math.nan
     first, second = (x.permute(2, 0, 1)[None] for x in (image, truth))
     margin, chunk_rows, total = SSIM_WINDOW // 2 if strip is None else 0, strip or SSIM_CHUNK_ROWS, 0.0
-    counted = torch.ones(height, width, dtype=torch.bool) if known is None else known
-    second = torch.where(counted, second, first)
+    valid = torch.ones(height, width, dtype=torch.bool) if known is None else known
+    second = torch.where(valid, second, first)
     for start in range(0, height, chunk_rows):
         end = min(start + chunk_rows, height)
         top, bottom = max(0, start - margin), min(height, end + margin)
         _, scores = structural_similarity_index_measure(
             first[:, :, top:bottom], second[:, :, top:bottom], data_range=1.0, return_full_image=True
         )
-        total += scores[0, :, start - top : end - top][:, counted[start:end]].double().sum().item()
-    return total / (3 * int(counted.sum())) if counted.any() else math.nan
+        total += scores[0, :, start - top : end - top][:, valid[start:end]].double().sum().item()
+    return total / (3 * int(valid.sum())) if valid.any() else math.nan

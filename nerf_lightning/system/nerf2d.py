@@ -1,4 +1,4 @@
-"""NeRF2D: fit a picture with a coordinate network."""
+"""NeRF2D: fits a coordinate network to an image."""
 
 import torch
 from jaxtyping import Float
@@ -11,13 +11,13 @@ from nerf_lightning.system.system import StepStats, System
 from nerf_lightning.system.torch_compile import maybe_compile
 
 PIXELS_PER_CHUNK_SAMPLE = 2
-"""Rendered at once, for each sample of `chunk`."""
+"""Pixels rendered at once per sample of `chunk`."""
 MAX_OFF_GRID_POINTS = 1 << 20
-"""About how many corners between pixels are looked at."""
+"""Pixel corners evaluated, about, at most."""
 
 
 class NeRF2D(System):
-    """field -> squared error; arguments as `System`."""
+    """Field trained with squared error; arguments as `System`."""
 
     field: PictureField
 
@@ -25,7 +25,7 @@ class NeRF2D(System):
         return {"field": self.field.lr_scale * self.schedule(progress, step)}
 
     def loss(self, batch: PixelBatch) -> Float[Tensor, ""]:
-        """What a step minimises."""
+        """Mean squared error of the batch."""
         return torch.nn.functional.mse_loss(
             maybe_compile(self.field.forward, self.compile_backend)(batch.uv), batch.rgb
         )
@@ -46,20 +46,16 @@ class NeRF2D(System):
 
     @torch.no_grad()
     def query_rgb(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        """The field's colours at any places, a chunk at a time, clamped to [0, 1]."""
-        colours = uv.new_empty(len(uv), 3)
-        for target, points in zip(
-            colours.split(PIXELS_PER_CHUNK_SAMPLE * self.chunk),
-            uv.split(PIXELS_PER_CHUNK_SAMPLE * self.chunk),
-            strict=True,
-        ):
+        """Field colours at `uv`, clamped to [0, 1], evaluated in chunks."""
+        rgb, size = uv.new_empty(len(uv), 3), PIXELS_PER_CHUNK_SAMPLE * self.chunk
+        for target, points in zip(rgb.split(size), uv.split(size), strict=True):
             target.copy_(self.field(points).clamp(0, 1))
-        return colours
+        return rgb
 
     def measure_off_grid_psnr(self, view: PictureBatch) -> float | None:
-        """PSNR at corners where four pixels meet, against their mean: if far below that of the pixels, the field overfits.
+        """PSNR at pixel corners against the mean of their four pixels; far below the pixels' own PSNR, the field overfits.
 
-        None for a picture of one row or one column.
+        None for an image of one row or column.
         """
         columns, corners = view.width - 1, (view.width - 1) * (view.height - 1)
         if not corners:
@@ -72,5 +68,5 @@ class NeRF2D(System):
 
     def diagnose(self, view: PictureBatch) -> str:
         rgb = self.query_rgb(view.uv)
-        is_plain = (rgb.amax(0) - rgb.amin(0)).max() <= 1 / 255
-        return "every place gets the same colour, which a lower learning rate avoids" if is_plain else ""
+        is_constant = (rgb.amax(0) - rgb.amin(0)).max() <= 1 / 255
+        return "the field has the same colour everywhere: lower the learning rate" if is_constant else ""

@@ -1,4 +1,4 @@
-"""NeRF3D: fit a radiance field to rays."""
+"""NeRF3D: fits a radiance field to rays."""
 
 import math
 from collections.abc import Sequence
@@ -23,17 +23,17 @@ from nerf_lightning.system.torch_compile import maybe_compile
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 SAMPLE_CHUNKS_PER_PASS = 16
-"""Samples that are found together without gradient before they are rendered, as multiples of `chunk`."""
+"""Samples drawn at once without gradient, in multiples of `chunk`."""
 
 
 class NeRF3D(System):
-    """sampler -> field -> renderer -> squared error.
+    """Radiance field training: sampler -> field -> renderer -> squared error.
 
     Args:
         field: position, direction -> density, rgb.
         sampler: rays -> samples.
         renderer: samples -> pixels.
-        corrections: of the training photos' cameras and light, learned with the field; None takes them as they are.
+        corrections: refinement of training cameras and exposure, learned with the field; None keeps them as given.
         optimizer, schedule, seed, chunk, compile_backend, state: see `System`.
     """
 
@@ -74,15 +74,15 @@ class NeRF3D(System):
 
     @property
     def datamodule(self) -> RayDataModule:
-        """What it trains on."""
+        """The trainer's data module."""
         return self.trainer.datamodule  # type: ignore[attr-defined]
 
     def configure_callbacks(self) -> list[L.Callback]:
-        """What changes between steps besides the weights: corrections that begin, and the field's resolution."""
+        """Adds correction trials and field growth."""
         return [CorrectionTrials(), FieldGrowth()]
 
     def on_fit_start(self) -> None:
-        if self.trainer.ckpt_path is None:  # what is resumed has marked them already
+        if self.trainer.ckpt_path is None:  # a checkpoint holds the marks
             self.sampler.mark_invisible_cells(self.datamodule.scene.train.cameras)
         self.datamodule.enable_texturelessness(self.renderer.is_texture_weighted)
         sync_resolution_scale(self, self.datamodule)
@@ -114,10 +114,10 @@ class NeRF3D(System):
         return sum_losses(losses)
 
     def compute_losses(self, batch: RayBatch, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
-        """The losses of a step by name, and what it did. All its randomness comes from `generator`."""
+        """Losses of a step by name, and its statistics. All randomness comes from `generator`."""
         rays = batch.rays
         if self.corrections is not None:
-            assert batch.views is not None  # training rays are of photos
+            assert batch.views is not None  # training batches have views
             rays = self.corrections.poses(rays, batch.views)
         with torch.no_grad():
             samples = self.sampler(rays.detach(), maybe_compile(self.field.density, self.compile_backend), generator)
@@ -127,7 +127,7 @@ class NeRF3D(System):
         if self.corrections is not None:
             assert batch.views is not None
             rgb = self.corrections.color(rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
-        if samples.complete is not None:  # a ray without all of its samples must not be learned from
+        if samples.complete is not None:  # truncated rays must not contribute
             rgb = torch.where(samples.complete[:, None], rgb, truth)
         squared_errors = (rgb - truth).square().mean(1)
         losses = {
@@ -146,7 +146,7 @@ class NeRF3D(System):
         return losses, stats
 
     def regularize(self, output: RenderOutput, samples: Samples, batch: RayBatch) -> dict[str, Float[Tensor, ""]]:
-        """The other losses by name: of the field, the rendering weights, and what the sampler learns from."""
+        """Regularization losses of field, renderer and sampler, by name."""
         return {
             **self.field.losses(),
             **self.renderer.losses(output, samples, self.state.progress, batch.texturelessness),
@@ -154,7 +154,7 @@ class NeRF3D(System):
         }
 
     def adapt_num_rays(self) -> None:
-        """Tells the data how many samples the last step took."""
+        """Adapts the number of rays per step to the samples that the last step drew."""
         if not self.stats.is_sample_count_exact:
             return
         drawn = self.stats.samples
@@ -163,22 +163,22 @@ class NeRF3D(System):
         self.datamodule.adapt_num_rays(drawn)
 
     def update_error_map(self) -> None:
-        """Tells the data how wrong each ray of the last step was."""
+        """Updates the data's error map with the last step's squared errors."""
         errors, complete = self.stats.squared_errors, self.stats.complete_rays
-        assert errors is not None  # a step of this system
-        if self.trainer.world_size > 1 and self.datamodule.error_sampling:  # else nobody asks
+        assert errors is not None  # set by `compute_losses`
+        if self.trainer.world_size > 1 and self.datamodule.error_sampling:  # otherwise unused
             errors, complete = self._gather_errors(errors, complete)
         self.datamodule.update_error_map(errors, complete)
 
     def _gather_errors(
         self, errors: Float[Tensor, "r"], complete: Bool[Tensor, "r"] | None
     ) -> tuple[Float[Tensor, "R"], Bool[Tensor, "R"]]:
-        """Those of all processes, since each draws for all: process p has the rays p, p + world, p + 2 world, ..."""
+        """Gathers the ray errors of all processes: process p has rays p, p + world, p + 2 world, ..."""
         world, rays = self.trainer.world_size, self.datamodule.rays
-        both = torch.stack([errors, torch.ones_like(errors) if complete is None else complete.float()])
-        padded = torch.nn.functional.pad(both, (0, -(-rays // world) - len(errors)))
+        stacked = torch.stack([errors, torch.ones_like(errors) if complete is None else complete.float()])
+        padded = torch.nn.functional.pad(stacked, (0, -(-rays // world) - len(errors)))
         gathered = self.all_gather(padded)
-        assert isinstance(gathered, Tensor)  # as what was given
+        assert isinstance(gathered, Tensor)  # one tensor in, one out
         errors, counted = gathered.permute(1, 2, 0).flatten(1)[:, :rays]
         return errors, counted > 0
 
@@ -191,32 +191,27 @@ class NeRF3D(System):
     def render(
         self, rays: Rays, near: float = 0.0, far: float = math.inf, background: Sequence[float] | None = None
     ) -> RenderOutput:
-        """Renders rays without gradient and without randomness, a chunk at a time.
+        """Renders rays without gradient or randomness, in chunks.
 
         Args:
             rays: on the system's device.
-            near, far: distances along each ray, scene's unit; nothing nearer or farther is seen.
-            background: colour in [0, 1]; None takes the renderer's own.
+            near, far: visible range along each ray, in scene units.
+            background: colour in [0, 1]; None takes the renderer's.
         """
-        background_rgb = (
-            self.renderer.background.color if background is None else torch.tensor(background, device=self.device)
-        )
-        parts, start, count = [], 0, self.chunk_rays
+        color = self.renderer.background.color if background is None else torch.tensor(background, device=self.device)
+        outputs, start, num_rays, max_samples = [], 0, self.chunk_rays, SAMPLE_CHUNKS_PER_PASS * self.chunk
         while start < len(rays):
-            chunk = rays[start : start + count]
-            found = self.sampler(chunk, self.field.density)
-            # Fog, which an early field is full of, leaves many times more along a ray than a surface does.
-            count = max(
-                1, min(self.chunk_rays, SAMPLE_CHUNKS_PER_PASS * self.chunk * len(chunk) // max(1, len(found.t)))
-            )
+            chunk = rays[start : start + num_rays]
+            samples = self.sampler(chunk, self.field.density)
+            # An early field is fog, which keeps many times more samples along a ray than a surface does.
+            num_rays = max(1, min(self.chunk_rays, max_samples * len(chunk) // max(1, len(samples.t))))
             start += len(chunk)
             if near > 0 or far < math.inf:
-                found = found.clip(near, far)
-            for run, samples in split_by_rays(found.merge_low_weight_samples(), self.chunk):
-                part_rays = chunk[run]
-                parts.append(self.renderer(part_rays, samples, self.field, background_rgb.expand(len(part_rays), 3)))
+                samples = samples.clip(near, far)
+            for span, part in split_by_rays(samples.merge_low_weight_samples(), self.chunk):
+                outputs.append(self.renderer(chunk[span], part, self.field, color.expand(len(chunk[span]), 3)))
         names = ("rgb", "opacity", "distance")
-        return RenderOutput(*(torch.cat([getattr(output, name) for output in parts]) for name in names))
+        return RenderOutput(*(torch.cat([getattr(output, name) for output in outputs]) for name in names))
 
     @property
     def background(self) -> list[float]:

@@ -1,4 +1,4 @@
-"""How well a trained field explains single photos: those it was trained on, and held-out ones by cameras of their own."""
+"""Quality of single photos: PSNR of training photos, and of held-out ones with test-time camera alignment."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -27,26 +27,23 @@ from nerf_lightning.utils.progress import track_progress
 from nerf_lightning.utils.seeding import Stream, step_generator
 
 PIXELS_PER_PHOTO = 256
-"""Of each training photo that are compared."""
+"""Pixels compared in each training photo."""
 MIN_OUTLIER_DEVIATIONS, MIN_OUTLIER_GAP_DB = 7.0, 6.0
-"""A photo stands out if it is this many robust standard deviations, and this many dB, worse than the median."""
+"""An outlier is below the median PSNR by this many robust standard deviations and this many dB."""
 IMAGE_HALVES = (0.0, 0.5), (0.5, 1.0)
-"""Shares of a held-out photo's columns: one half decides, the other is scored."""
+"""Column ranges of a held-out photo: cameras are fitted on one half and scored on the other."""
 JOINT_STEPS, PER_CAMERA_STEPS = 4, 6
-"""Least-squares steps of all cameras together, and then of each alone. More would follow the faults of the field there."""
+"""Least-squares steps of all cameras jointly, then of each alone. More would overfit the field's errors."""
 ALIGN_PIXELS, MIN_ALIGN_PIXELS = 2048, 256
-"""Of each half, that decide in a step: usually, and where there is little time."""
+"""Pixels of each half fitted per step: default, and minimum where time is short."""
 SCORED_PIXELS = 1 << 15
-"""Of each half, that are scored."""
+"""Pixels scored in each half."""
 ALIGN_COST_PIXELS = 2 * ((JOINT_STEPS + PER_CAMERA_STEPS) * ALIGN_PIXELS * 5 + SCORED_PIXELS)
-"""Rendering a photo's pixels so often takes as long as all that is done for it: derivatives take as long as three."""
+"""Cost of aligning and scoring a photo, in rendered pixels: derivatives cost as much as three."""
 
 
 def measure_photo_psnr(system: NeRF3D, views: Views) -> list[float]:
-    """PSNR of each training photo in dB, by some of its pixels; nan where none of those is known.
-
-    Cameras and light are taken as corrected, if they are.
-    """
+    """PSNR in dB of each training photo as corrected, on a sample of its pixels; nan where none is known."""
     views = views.to(system.device)
     generator = step_generator(system.seed, Stream.ANALYSIS, 2, system.device)
     pixels = sample_photo_pixels(
@@ -60,33 +57,30 @@ def measure_photo_psnr(system: NeRF3D, views: Views) -> list[float]:
 def compute_photo_errors(
     render: RenderFn, corrections: Corrections | None, pixels: PhotoPixels, num_photos: int
 ) -> Float[Tensor, "V"]:
-    """Squared errors of each photo's pixels as rendered, see `compute_squared_errors`."""
+    """Renders pixels and sums their squared errors by photo, see `compute_squared_errors`."""
     return compute_squared_errors(render_photo_pixels(render, corrections, pixels), corrections, pixels, num_photos)
 
 
 def find_outlier_photos(psnrs: list[float]) -> list[int]:
-    """Numbers of the photos that stand out, worst first.
-
-    The spread of the others is 1.4826 times their median absolute deviation, as of a normal distribution.
-    """
+    """Indices of outlier photos, worst first. The standard deviation is 1.4826 times the median absolute deviation."""
     values = torch.tensor(psnrs, dtype=torch.float64)
-    middle = values.nanmedian()
-    spread = 1.4826 * (values - middle).abs().nanmedian()
-    limit = float(middle - max(MIN_OUTLIER_GAP_DB, MIN_OUTLIER_DEVIATIONS * float(spread)))
+    median = values.nanmedian()
+    deviation = 1.4826 * (values - median).abs().nanmedian()
+    limit = float(median - max(MIN_OUTLIER_GAP_DB, MIN_OUTLIER_DEVIATIONS * float(deviation)))
     return sorted((i for i, value in enumerate(psnrs) if value < limit), key=psnrs.__getitem__)
 
 
-@torch.inference_mode(False)  # a trainer's test is without gradients
+@torch.inference_mode(False)  # a trainer tests in inference mode
 def measure_aligned_psnr(system: NeRF3D, views: Views, fraction: float = 1.0) -> list[float]:
-    """PSNR of each held-out photo in dB, by a camera and gains that were found on the half that is not scored.
+    """PSNR in dB of each held-out photo with test-time camera alignment, as NeRF-W does for appearance.
 
-    Cameras that were corrected may together stand a little apart from where held-out ones are said to be: this figure asks
-    how good the field is, and not whether both agree.
+    Poses and gains are fitted on one half of a photo and scored on the other: refined cameras may differ from held-out ones by
+    a global transform, which is no fault of the field.
 
     Args:
         system: with corrections.
         views: the held-out photos.
-        fraction: of the pixels that usually decide, as far as `MIN_ALIGN_PIXELS`, for less time.
+        fraction: of `ALIGN_PIXELS` to fit, at least `MIN_ALIGN_PIXELS`, to save time.
     """
     assert system.corrections is not None  # else there is nothing to align
     views, background = views.to(system.device), system.renderer.background.color
@@ -116,7 +110,7 @@ def measure_aligned_psnr(system: NeRF3D, views: Views, fraction: float = 1.0) ->
 
 
 def align_cameras(render: RenderFn, corrections: Corrections, draw: Callable[[Sequence[int]], PhotoPixels]) -> None:
-    """Finds corrections with which a field, that stays as it is, fits drawn pixels of each photo best."""
+    """Fits poses and gains to drawn pixels of each photo by damped least squares, with the field frozen."""
     poses, exposure = (name in corrections.enabled_at for name in ("poses", "exposure"))
     update_columns = slice(POSES.start if poses else EXPOSURE.start, EXPOSURE.stop if exposure else POSES.stop)
     common = corrections.poses.gauge.unflatten(0, (-1, 6))
@@ -128,21 +122,21 @@ def align_cameras(render: RenderFn, corrections: Corrections, draw: Callable[[Se
     steps = range(0 if poses else JOINT_STEPS, JOINT_STEPS + PER_CAMERA_STEPS)
     for step in track_progress(steps, len(steps), "aligning held-out photos"):
         photos = [draw([view]) for view in range(len(unknowns[0]))]  # one by one, as there may be many
-        found = [compute_residual_jacobian(render, corrections, pixels, 1) for pixels in photos]
-        residuals, jacobian = (torch.cat(parts) for parts in zip(*found, strict=True))
-        change = torch.zeros_like(jacobian[:, 0])
+        terms = [compute_residual_jacobian(render, corrections, pixels, 1) for pixels in photos]
+        residuals, jacobian = (torch.cat(parts) for parts in zip(*terms, strict=True))
+        update = torch.zeros_like(jacobian[:, 0])
         if step < JOINT_STEPS:
             shared = solve_damped_least_squares(
                 residuals.flatten(0, 1)[None], (jacobian[..., POSES] @ common).flatten(0, 1)[None]
             )
-            change[:, POSES] = (common @ shared.mT)[..., 0]
+            update[:, POSES] = (common @ shared.mT)[..., 0]
             if exposure:
-                change[:, EXPOSURE] = solve_damped_least_squares(residuals, jacobian[..., EXPOSURE])
+                update[:, EXPOSURE] = solve_damped_least_squares(residuals, jacobian[..., EXPOSURE])
         else:
-            change[:, update_columns] = solve_damped_least_squares(residuals, jacobian[..., update_columns])
-        before, before_update = errors(photos), [parameter.data.clone() for parameter in unknowns]
+            update[:, update_columns] = solve_damped_least_squares(residuals, jacobian[..., update_columns])
+        errors_before, values_before = errors(photos), [parameter.data.clone() for parameter in unknowns]
         for parameter, columns in zip(unknowns, (POSES, EXPOSURE), strict=True):
-            parameter.data += change[:, columns]
-        better = (errors(photos) < before)[:, None]
-        for parameter, value in zip(unknowns, before_update, strict=True):
-            parameter.data = torch.where(better, parameter.data, value)
+            parameter.data += update[:, columns]
+        has_improved = (errors(photos) < errors_before)[:, None]
+        for parameter, value in zip(unknowns, values_before, strict=True):
+            parameter.data = torch.where(has_improved, parameter.data, value)

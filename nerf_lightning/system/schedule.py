@@ -1,4 +1,4 @@
-"""Learning-rate factors as functions of progress, the part of the budget done, so that they fit any budget, and of the step."""
+"""Learning-rate factors as functions of training progress, so that they fit any budget, and of the step."""
 
 import math
 
@@ -6,14 +6,14 @@ from nerf_lightning.utils.option_checks import Count
 
 
 def _warmup_factor(progress: float, step: int, warmup: float, inverse_sqrt_after: Count | None) -> float:
-    """The factor that all have in common: a linear warm-up, and 1 / sqrt(1 + step / inverse_root)."""
+    """Linear warm-up, times 1 / sqrt(1 + step / inverse_sqrt_after)."""
     factor = min(1.0, (progress + 1e-3) / (warmup + 1e-3))
     return factor if inverse_sqrt_after is None else factor / math.sqrt(1 + step / inverse_sqrt_after)
 
 
 def constant(progress: float, step: int = 0, warmup: float = 0.0, inverse_sqrt_after: Count | None = None) -> float:
-    """1 after a linear warm-up over the first `warmup` of the budget; besides, as one over the root of steps, if many of these
-    are to be taken: from `inverse_sqrt_after` steps on. A long training at the rate of a short one loses what it has."""
+    """1 after a linear warm-up over the first `warmup` of the budget, times 1 / sqrt(1 + step / inverse_sqrt_after): a long
+    training at the learning rate of a short one loses quality."""
     return _warmup_factor(progress, step, warmup, inverse_sqrt_after)
 
 
@@ -24,7 +24,7 @@ def exponential(
     final_factor: float = 0.1,
     inverse_sqrt_after: Count | None = None,
 ) -> float:
-    """As `constant`, times final_factor^progress: from 1 down to `final_factor` at the end."""
+    """`constant` times final_factor^progress: from 1 down to `final_factor`."""
     return _warmup_factor(progress, step, warmup, inverse_sqrt_after) * final_factor**progress
 
 
@@ -35,6 +35,6 @@ def cosine(
     final_factor: float = 0.0,
     inverse_sqrt_after: Count | None = None,
 ) -> float:
-    """As `constant`, times half a cosine from 1 down to `final_factor` at the end."""
+    """`constant` times half a cosine from 1 down to `final_factor`."""
     factor = final_factor + (1 - final_factor) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
     return _warmup_factor(progress, step, warmup, inverse_sqrt_after) * factor

@@ -1,4 +1,4 @@
-"""The state of a training run that the system and its callbacks share: progress, learning-rate scale and clock."""
+"""Training state shared by the system and its callbacks: progress, learning-rate scale and clock."""
 
 import time
 from collections.abc import Iterator
@@ -12,11 +12,11 @@ from nerf_lightning.utils.machine import CpuLoad
 
 
 class TrainingClock:
-    """Seconds of training: the wall clock from the first step on, less what runs inside `pause()`."""
+    """Training time: wall-clock seconds from the first step on, without `pause()` blocks."""
 
     def __init__(self) -> None:
         self.has_started = False
-        """Whether training has begun, or gone on."""
+        """Whether training has started or resumed."""
         self.load = CpuLoad()
         """CPU use of this process and of others while the clock ran."""
         self._device = CPU
@@ -25,15 +25,15 @@ class TrainingClock:
 
     @property
     def seconds(self) -> float:
-        """Trained so far."""
+        """Seconds trained so far."""
         return self._elapsed if self._start_time is None else self._elapsed + time.perf_counter() - self._start_time
 
     def set_seconds(self, seconds: float) -> None:
-        """Goes on from a time that a checkpoint kept."""
+        """Restores the seconds of a checkpoint."""
         self._elapsed = seconds
 
     def start(self, device: torch.device) -> None:
-        """Starts, for training on a device."""
+        """Starts the clock for training on a device."""
         self.has_started, self._device = True, device
         self._resume()
 
@@ -49,7 +49,7 @@ class TrainingClock:
 
     @contextmanager
     def pause(self) -> Iterator[None]:
-        """Stops for work that is not training."""
+        """Pauses the clock for work that is not training."""
         is_running = self._start_time is not None
         self.stop()
         try:
@@ -61,18 +61,16 @@ class TrainingClock:
 
 @dataclass
 class TrainingState:
-    """How far training is; given to the system and to the callbacks that steer it."""
+    """Progress of training, learning-rate scale and clock."""
 
     progress: float = 0.0
-    """Share of the training done."""
+    """Fraction of the training done."""
     lr_scale: float = 1.0
-    """Factor on all learning rates, besides their schedule."""
+    """Factor on all learning rates, on top of their schedule."""
     clock: TrainingClock = field(default_factory=TrainingClock)
 
     def set_progress(self, progress: float) -> None:
-        """Sets the share of the training done."""
         self.progress = progress
 
     def set_lr_scale(self, factor: float) -> None:
-        """Sets the factor on all learning rates."""
         self.lr_scale = factor

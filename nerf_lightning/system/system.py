@@ -1,4 +1,4 @@
-"""What NeRF2D and NeRF3D share: the optimiser, its schedule, and the evaluation of whole views."""
+"""Base class of NeRF2D and NeRF3D: optimiser, schedule, and evaluation of whole views."""
 
 import math
 import time
@@ -30,31 +30,31 @@ Schedule = Callable[[float, int], float]
 
 @dataclass(frozen=True)
 class StepStats:
-    """What the last training step did."""
+    """Statistics of the last training step."""
 
     mse: Float[Tensor, ""]
-    """On the device: reading it means waiting for it."""
+    """On the device: reading it synchronizes."""
     rays: int
     """Rays, or pixels in 2D."""
     samples: int
     opacity: Float[Tensor, "R"] | None = None
-    """Of each ray, on the device: 0 is empty, 1 is opaque."""
+    """Opacity of each ray, on the device: 0 is empty, 1 is opaque."""
     squared_errors: Float[Tensor, "R"] | None = None
     """Squared error of each ray, on the device."""
     complete_rays: Bool[Tensor, "R"] | None = None
-    """Which rays have all their samples; None for all."""
+    """Rays that have all their samples; None for all."""
     losses: Mapping[str, Tensor] = field(default_factory=dict)
-    """What the loss is the sum of, by name, on the device."""
+    """Terms of the loss by name, on the device."""
 
     @property
     def is_sample_count_exact(self) -> bool:
-        """Whether `samples` is their count; otherwise it is the room for them."""
+        """True if `samples` is exact; False if it is the buffer capacity."""
         return self.complete_rays is None
 
 
 @dataclass(frozen=True)
 class ViewResult:
-    """One view rendered, beside its truth. Colours in [0, 1]."""
+    """A rendered view and its ground truth. Colours in [0, 1]."""
 
     rgb: Float[Tensor, "H W 3"]
     truth: Float[Tensor, "H W 3"]
@@ -70,42 +70,41 @@ class ViewResult:
 
     @property
     def num_pixels(self) -> int:
-        """How many were rendered."""
         return self.rgb.shape[:2].numel()
 
     @cached_property
     def ssim(self) -> float:
-        """Structural similarity: where nobody asks, its time is saved."""
+        """Structural similarity, computed on first access."""
         return ssim(self.rgb, self.truth, self.known, self.strip)
 
     @property
     def masked_truth(self) -> Float[Tensor, "H W 3"]:
-        """The truth; the render itself where the truth is not known."""
+        """The truth, replaced by the render where unknown."""
         return self.truth if self.known is None else torch.where(self.known[..., None], self.truth, self.rgb)
 
     @property
     def errors(self) -> Float[Tensor, "H W 3"]:
-        """Absolute differences; 0 where the truth is not known."""
+        """Absolute differences; 0 where the truth is unknown."""
         return (self.rgb - self.masked_truth).abs()
 
 
 def sum_losses(losses: Mapping[str, Tensor]) -> Float[Tensor, ""]:
-    """What a step minimises: the sum of its losses."""
+    """Total loss of a step."""
     first, *others = losses.values()
     return sum(others, first)
 
 
 class System(L.LightningModule):
-    """Base of the two systems.
+    """Base class of NeRF2D and NeRF3D.
 
     Args:
-        field: place -> rgb, or position, direction -> density, rgb.
-        optimizer: makes the optimiser from the parameters.
-        schedule: factor on its learning rate by progress and step.
+        field: uv -> rgb, or position, direction -> density, rgb.
+        optimizer: makes the optimiser from the parameter groups.
+        schedule: factor on the learning rate by progress and step.
         seed: of all randomness in training steps.
-        chunk: samples rendered at once without gradient: bounds the memory that a view of any size takes.
-        compile_backend: compiler of the parts of a training step, see `torch_compile.maybe_compile`; None does not compile.
-        state: of the training, shared with the callbacks that steer it; None makes one.
+        chunk: samples rendered at once without gradient; bounds the memory of a view.
+        compile_backend: torch.compile backend of training steps, see `torch_compile.maybe_compile`; None does not compile.
+        state: training state shared with callbacks; None makes one.
     """
 
     def __init__(
@@ -127,39 +126,39 @@ class System(L.LightningModule):
         self.compile_backend = compile_backend
         self.state = state or TrainingState()
         self.corrections: Corrections | None = None
-        """Of the training photos' cameras and light."""
+        """Refinement of training cameras and exposure."""
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
 
     def warm_start_from(self, source: "System") -> None:
-        """Continues from what a system with a smaller field of the same kind has learned."""
+        """Initializes from a trained system whose field is a smaller one of the same kind."""
         field: Any = self.field
         field.warm_start_from(source.field)
 
     @property
     def exportable_modules(self) -> dict[str, Any]:
-        """What a compact file keeps, by name: modules with `export_state` and `import_state`."""
+        """Modules of a compact file by name: those with `export_state` and `import_state`."""
         return {name: module for name, module in self.named_children() if hasattr(module, "export_state")}
 
     @property
     def is_corrected(self) -> bool:
-        """Whether cameras or light of the training photos were corrected."""
+        """Whether poses or exposure of the training photos are corrected."""
         return self.corrections is not None and bool(self.corrections.enabled_at)
 
     def compute_losses(self, batch: Any, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
-        """The losses of a step by name, and what it did. All its randomness comes from `generator`."""
+        """Losses of a step by name, and its statistics. All randomness comes from `generator`."""
         raise TypeError(f"{type(self).__name__} must define compute_losses(batch, generator)")
 
     def warm_up_kernels(self, batch: Any) -> None:
-        """Computes the gradients of a step, so that kernels are compiled."""
+        """Runs a forward and backward pass, so that kernels are compiled."""
         losses, _ = self.compute_losses(batch.to(self.device), step_generator(0, Stream.STEP, 0, self.device))
         sum_losses(losses).backward()
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """The optimiser's groups of parameters, each with a name; without `lr`, one takes the optimiser's own."""
+        """Named parameter groups of the optimiser; one without `lr` takes the optimiser's."""
         return [{"name": "field", "params": list(self.parameters())}]
 
     def lr_factors(self, progress: float, step: int) -> dict[str, float]:
-        """Factors on the groups' learning rates, by name."""
+        """Learning-rate factors of the parameter groups, by name."""
         return {"field": self.schedule(progress, step)}
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -169,7 +168,6 @@ class System(L.LightningModule):
         return optimizer
 
     def set_learning_rates(self, optimizer: torch.optim.Optimizer, step: int) -> None:
-        """Sets each group's learning rate for a step."""
         factors = self.lr_factors(self.state.progress, step)
         for group in optimizer.param_groups:
             group["lr"] = group["initial_lr"] * factors[group["name"]] * self.state.lr_scale
@@ -180,37 +178,37 @@ class System(L.LightningModule):
         self.set_learning_rates(self.trainer.optimizers[0], self.global_step)
 
     def set_first_step(self, step: int) -> None:
-        """Called where training goes on that started again at a step."""
+        """Called when a run resumes whose training was restarted at `step`."""
 
     def restart(self, step: int) -> None:
-        """Called when training starts again at a step, with a fresh field."""
+        """Called when training restarts at `step` with fresh weights."""
 
     def compute_target_rgb(self, batch: Any) -> Float[Tensor, "N 3"]:
-        """The colours that a batch should have in evaluation."""
+        """Target colours of an evaluation batch."""
         raise TypeError(f"{type(self).__name__} must define compute_target_rgb(batch)")
 
     def render_view(
         self, view: Any
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"] | None, Float[Tensor, "N"] | None]:
-        """The field's colours of a whole view, with depth and opacity if it has them."""
+        """Rendered colours of a whole view, with depth and opacity if the field has them."""
         raise TypeError(f"{type(self).__name__} must define render_view(view)")
 
     @property
     def background(self) -> list[float] | None:
-        """The background of evaluated views; None for a picture."""
+        """Background colour of evaluated views; None for an image."""
         return None
 
     def measure_off_grid_psnr(self, view: Any) -> float | None:
-        """PSNR of a picture's field between its pixels; None where there is none to measure."""
+        """PSNR between the pixels of an image; None where it does not apply."""
         return None
 
     def diagnose(self, view: Any) -> str:
-        """What is wrong with a field that has learned nothing, in words; "" if unknown."""
+        """Explains why a field has learned nothing; "" if unknown."""
         return ""
 
     @torch.no_grad()
     def evaluate(self, view: Any) -> ViewResult:
-        """Renders a whole view and measures it."""
+        """Renders a whole view and computes its metrics."""
         view = view.to(self.device)
         synchronize(self.device)
         start = time.perf_counter()
@@ -226,8 +224,8 @@ class System(L.LightningModule):
         return ViewResult(rgb, truth, psnr(rgb, truth, known), seconds, depth, opacity, known, view.strip)
 
     def evaluate_views(self, views: Iterable[Any]) -> Iterator[ViewResult]:
-        """Evaluates views one after the other, in memory that training has given back."""
-        self.zero_grad()  # which the next step does in any case
+        """Evaluates views one by one, after releasing the memory that training has freed."""
+        self.zero_grad()  # as the next step does anyway
         release_freed_memory()
         try:
             yield from map(self.evaluate, views)
@@ -237,7 +235,7 @@ class System(L.LightningModule):
     def evaluate_held_out(
         self, data: StepDataModule, views: Iterable[int], subset: PixelSubset = ALL_PIXELS
     ) -> Iterator[ViewResult]:
-        """Evaluates some of the held-out views, or some of their pixels."""
+        """Evaluates held-out views, or a subset of their pixels."""
         return self.evaluate_views(data.get_held_out_view(view, subset) for view in views)
 
     def on_test_start(self) -> None:

@@ -1,7 +1,6 @@
-"""torch.compile for the parts of a training step with a fixed structure: fields and the renderer, not the samplers.
+"""torch.compile for the parts of a training step with a fixed structure: fields and renderer, not samplers.
 
-Compiled code belongs to no module: copies, checkpoints and pickles stay as they are, and code compiled for a copy serves the
-original.
+Compiled code belongs to a class, not to a module: copies, checkpoints and pickles stay unchanged, and copies share it.
 """
 
 import functools
@@ -16,16 +15,15 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.kernels.cached_constants import CACHED_FUNCTIONS
 
 COMPILE_BACKEND = "inductor"
-"""What a run compiles with."""
 MAX_RECOMPILES = 64
-"""Most times that a part is compiled again for another size of a growing field; after that it runs uncompiled."""
+"""Recompilations of a part for new sizes of a growing field; beyond that it runs uncompiled."""
 
 
 @functools.cache
 def _configure_compiler() -> None:
-    """Tells the compiler that what kernels cache for a device is constant."""
+    """Configures Dynamo: the recompile limit, and cached kernel constants as constant."""
     torch._dynamo.config.recompile_limit = MAX_RECOMPILES
-    # About just these functions, and about tensors passed from one part to the next.
+    # Warnings about these functions and about tensors passed between parts.
     for message in (".*`functools.lru_cache`-wrapped function.*", ".*a Tensor that is not a leaf Tensor.*"):
         warnings.filterwarnings("ignore", message)
     for function in CACHED_FUNCTIONS:
@@ -33,7 +31,7 @@ def _configure_compiler() -> None:
 
 
 def _assume_constant(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function with constant results. They are parameters, as the compiler takes those to have a fixed size."""
+    """Makes a function's results constants of the graph: parameters, whose size the compiler takes as fixed."""
 
     @torch._dynamo.assume_constant_result
     def boxed(*args: Any) -> list[Any]:  # in a list: one graph cannot take two single tensors of the same name
@@ -41,14 +39,14 @@ def _assume_constant(function: Callable[..., Any]) -> Callable[..., Any]:
             tree_map_only(torch.Tensor, lambda x: torch.nn.Parameter(x.clone(), requires_grad=False), function(*args))
         ]
 
-    def made(*args: Any) -> Any:
+    def unboxed(*args: Any) -> Any:
         return boxed(*args)[0]
 
-    return made
+    return unboxed
 
 
 def _canonicalize(value: Any) -> Any:
-    """An argument of a compiled part in a standard form: a view of another tensor would be compiled again."""
+    """Canonicalizes an argument (contiguous, not a view), to avoid recompilation."""
     if isinstance(value, torch.Tensor):
         return value.contiguous() if value._base is None else value.clone(memory_format=torch.contiguous_format)
     return value
@@ -56,28 +54,28 @@ def _canonicalize(value: Any) -> Any:
 
 @functools.cache
 def _compile_method(function: Callable[..., Any], backend: str) -> Callable[..., Any]:
-    """A method of a class, compiled once in a process for all modules of that class."""
+    """Compiles a method once per process, for all modules of its class."""
     _configure_compiler()
     compiled = torch.compile(function, dynamic=True, backend=backend)
 
     def call(*args: Any) -> Any:
-        return compiled(*(_canonicalize(one) for one in args))
+        return compiled(*(_canonicalize(arg) for arg in args))
 
     return call
 
 
 def maybe_compile(method: Any, backend: str | None) -> Callable[..., Any]:
-    """A module's bound method: compiled if there is a backend (positional arguments only), else unchanged."""
+    """Compiles a module's bound method (positional arguments only); unchanged without a backend."""
     if backend is None:
         return method
     return functools.partial(_compile_method(method.__func__, backend), method.__self__)
 
 
 def check_compiler(device: torch.device, backend: str) -> None:
-    """Compiles a tiny function, to see whether compiling works.
+    """Checks that torch.compile works, by compiling a tiny function.
 
     Raises:
-        InputError: if it does not, mostly for want of a C++ compiler, or of Triton for CUDA.
+        InputError: if it fails, mostly without a C++ compiler, or without Triton for CUDA.
     """
 
     def double(x: torch.Tensor) -> torch.Tensor:

@@ -1,1 +1,1 @@
-"""One training run, and many from one command line."""
+"""Training runs and sweeps."""

@@ -1,4 +1,4 @@
-"""One job of a sweep: skipped if it is done, resumed if it was stopped, and recorded if it fails."""
+"""Sweep job: skipped if it is done, resumed if it was stopped, and recorded if it fails."""
 
 import sys
 import traceback
@@ -34,49 +34,49 @@ def run_job(cfg: DictConfig) -> float | None:
         The held-out PSNR in dB; None for a job that failed.
 
     Raises:
-        NoRoom, OSError: for a full disk, which would end the other jobs too.
+        DiskFullError, OSError: for a full disk, which would fail the other jobs too.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
     root = Path(HydraConfig.get().sweep.dir)
     try:
-        with handle_signals(), lock_folder(folder):  # this may be a process of a launcher
+        with handle_signals(), lock_folder(folder):  # may run in a launcher's process
             try:
                 return continue_job(cfg, folder)
             except Exception as error:  # noqa: BLE001  (recorded with its traceback; the other jobs must go on)
                 if is_rank_zero():
                     record_error(folder, cfg, error)
-                if is_disk_full(error):  # and for the jobs after it
+                if is_disk_full(error):  # later jobs would fail too
                     raise
                 return None
-    except RunFolderInUse as error:  # as by the same command a second time: what it does is not done twice
+    except RunFolderInUse as error:  # as by the same command, run twice at a time
         print(f"{folder.name}: {error}", file=sys.stderr, flush=True)
         return None
     finally:
-        with suppress(InputError):  # interrupted before any job wrote something, or a full disk, which has been told
+        with suppress(InputError):  # interrupted before any job wrote, or a full disk, reported already
             if is_rank_zero():
                 write_table(root, find_runs(root))
 
 
 def continue_job(cfg: DictConfig, folder: Path) -> float | None:
-    """The held-out PSNR of a job in a folder that this process owns, from now, from before, or from its last checkpoint on."""
+    """Skips, resumes or starts a job in a folder that this process has locked. Returns the held-out PSNR in dB."""
     check_run_options(cfg, HydraConfig.get().runtime.choices)
-    before = read_run(folder)
-    other = has_run_outputs(folder) and before.config != config_to_dict(cfg)
-    if other and before.status != "failed" and not cfg.overwrite:
+    previous = read_run(folder)
+    has_other_run = has_run_outputs(folder) and previous.config != config_to_dict(cfg)
+    if has_other_run and previous.status != "failed" and not cfg.overwrite:
         raise make_run_exists_error(folder)
-    done, checkpoint = find_progress(before, cfg)
+    finished, checkpoint = find_progress(previous, cfg)
     if is_rank_zero():
-        for name in (ERROR_FILE,) if done is not None else (ERROR_FILE, "results.json"):
+        for name in (ERROR_FILE,) if finished is not None else (ERROR_FILE, "results.json"):
             remove_path(folder / name)
-    if done is not None:
-        print(f"{folder.name}: done before ({done.status}, {done.psnr_text})", flush=True)
-        return done.psnr
+    if finished is not None:
+        print(f"{folder.name}: done before ({finished.status}, {finished.psnr_text})", flush=True)
+        return finished.psnr
     print(f"{folder.name}: {'starts' if checkpoint is None else 'continues from its last checkpoint'}", flush=True)
     return train(cfg, checkpoint)
 
 
 def find_progress(run: RunSummary, cfg: DictConfig) -> tuple[RunSummary | None, Path | None]:
-    """How far a run is, if it has this configuration.
+    """Finds how far a run with this configuration got.
 
     Returns:
         The run, if it is finished; otherwise its last checkpoint, if there is one to continue from.
@@ -88,14 +88,14 @@ def find_progress(run: RunSummary, cfg: DictConfig) -> tuple[RunSummary | None, 
     last = run.folder / "checkpoints" / "last.ckpt"
     try:
         read_checkpoint(last, RESUME_KEYS)
-    except InputError:  # none yet, or a broken one: from the start
+    except InputError:  # none yet, or a damaged one: start anew
         return None, None
     return None, last
 
 
 def record_error(folder: Path, cfg: DictConfig, error: Exception) -> None:
-    """Writes what went wrong: to results.json, unless the run wrote one itself or an earlier run's must stay, and with its
-    traceback to error.txt; on a full disk as much of it as there is room for."""
+    """Writes an error to results.json, unless the run wrote one itself or an earlier run's must stay, and its traceback to
+    error.txt; on a full disk as much as fits."""
     diagnosis = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
     diagnosis = " ".join(diagnosis.split())
     print(f"{folder.name}: failed: {diagnosis}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""Where curves go: TensorBoard, and services whose packages are extras."""
+"""Loggers: TensorBoard over training time, Weights & Biases, and MLflow."""
 
 import functools
 import os
@@ -15,27 +15,17 @@ from lightning.pytorch.utilities import rank_zero_only
 from nerf_lightning.callbacks.throughput import TRAIN_SECONDS_KEY
 from nerf_lightning.utils.libraries import require_extra
 
-LOGGED_OPTIONS = (
-    "dataset",
-    "model",
-    "sampler",
-    "renderer",
-    "optimizer",
-    "schedule",
-    "budget",
-    "method",
-    "recipe",
-    "seed",
-)
-"""What services are told of the configuration."""
+LOGGED_GROUPS = ("dataset", "model", "sampler", "renderer", "optimizer", "schedule", "budget")
+LOGGED_OPTIONS = (*LOGGED_GROUPS, "method", "recipe", "seed")
+"""Configuration keys logged as hyperparameters."""
 LOGGED_METRICS = ("psnr", "ssim", "psnr_worst_view", "train_seconds", "render_seconds_per_view", "artifact_bytes")
-"""And of the results."""
+"""Results logged as final metrics."""
 
 
 class TimedTensorBoardLogger(TensorBoardLogger):
-    """TensorBoard with one event file a run, and times that are seconds of training.
+    """TensorBoard logger with one event file per run, and training seconds as its times.
 
-    Figures logged with `TRAIN_SECONDS_KEY` are dated by it: on TensorBoard's axis RELATIVE they run over training time.
+    Metrics logged with `TRAIN_SECONDS_KEY` are dated by it: TensorBoard's axis RELATIVE shows training time.
 
     Args:
         save_dir: the run's folder, which holds the file.
@@ -45,19 +35,19 @@ class TimedTensorBoardLogger(TensorBoardLogger):
         super().__init__(save_dir, name="", version="", default_hp_metric=False)
 
     @functools.cached_property
-    def began(self) -> float:
+    def start_time(self) -> float:
         return time.time()
 
     @rank_zero_only
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         seconds = metrics.get(TRAIN_SECONDS_KEY)
-        date = None if seconds is None else self.began + seconds
+        walltime = None if seconds is None else self.start_time + seconds
         for name, value in metrics.items():
-            self.experiment.add_scalar(name, value, step, walltime=date)
+            self.experiment.add_scalar(name, value, step, walltime=walltime)
 
     @rank_zero_only
     def log_summary(self, options: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-        """Fills the HParams tab and closes the file. PSNR and seconds are curves, whose last values the tab shows."""
+        """Fills the HParams tab and closes the file. The tab shows the last values of the PSNR and seconds curves."""
         from torch.utils.tensorboard.summary import hparams
 
         values = {key: options.get(key) or "" for key in ("method", "recipe")}
@@ -67,17 +57,17 @@ class TimedTensorBoardLogger(TensorBoardLogger):
         self.experiment.close()
 
     def save(self) -> None:
-        """Writes no hparams.yaml: a run's config.yaml has all."""
+        """Writes no hparams.yaml: the run's config.yaml holds everything."""
 
     @rank_zero_only
     def finalize(self, status: str) -> None:
-        """Closes the file of a run that failed; testing goes on writing after training."""
+        """Closes the file of a failed run; after training, testing continues it."""
         if status != "success":
             self.experiment.close()
 
 
 def log_summary(logger: Logger, options: Mapping[str, Any], results: Mapping[str, Any]) -> None:
-    """Writes a run's options and final figures, and closes the logger."""
+    """Logs a run's options and final metrics, and closes the logger."""
     if isinstance(logger, TimedTensorBoardLogger):
         logger.log_summary(options, results)
         return
@@ -91,15 +81,15 @@ def log_summary(logger: Logger, options: Mapping[str, Any], results: Mapping[str
 def make_wandb_logger(
     save_dir: Path, project: str = "nerf_lightning", name: str | None = None, offline: bool = False
 ) -> WandbLogger:
-    """Weights & Biases.
+    """Makes a Weights & Biases logger.
 
     Args:
-        save_dir: of its own files, below `wandb/`.
-        project, name: of the run there.
+        save_dir: of its files, below `wandb/`.
+        project, name: of the W&B run.
         offline: whether to keep the run in those files, for `wandb sync`.
 
     Raises:
-        InputError: where the extra `wandb` is not installed.
+        InputError: if the extra `wandb` is not installed.
     """
     require_extra("wandb", "wandb", purpose="logging to Weights & Biases", hint=", or logger=csv")
     return WandbLogger(name, save_dir, project=project, offline=offline)
@@ -108,14 +98,14 @@ def make_wandb_logger(
 def make_mlflow_logger(
     save_dir: Path, experiment_name: str = "nerf_lightning", run_name: str | None = None
 ) -> MLFlowLogger:
-    """MLflow: the server that MLFLOW_TRACKING_URI names, else `mlflow.db` in the current folder, where `mlflow ui` looks.
+    """Makes an MLflow logger, for the server in MLFLOW_TRACKING_URI, else for `mlflow.db` in the current folder.
 
     Args:
         save_dir: the run's folder, where nothing is written.
-        experiment_name, run_name: of the run there.
+        experiment_name, run_name: of the MLflow run.
 
     Raises:
-        InputError: where the extra `mlflow` is not installed.
+        InputError: if the extra `mlflow` is not installed.
     """
     require_extra("mlflow", "mlflow", purpose="logging to MLflow", hint=", or logger=csv")
     uri = os.environ.get("MLFLOW_TRACKING_URI") or "sqlite:///mlflow.db"
@@ -124,7 +114,7 @@ def make_mlflow_logger(
 
 @contextmanager
 def finish_wandb() -> Iterator[None]:
-    """Ends the run that a training opens at Weights & Biases: the next one of this process would go on writing into it."""
+    """Finishes the W&B run that a training opens, or the next one in this process would write into it."""
     before = getattr(sys.modules.get("wandb"), "run", None)
     try:
         yield

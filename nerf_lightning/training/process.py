@@ -1,4 +1,4 @@
-"""What training sets and checks in its process before the clock starts."""
+"""Process setup before training: threads, kernels, seed and warm-up."""
 
 import copy
 from contextlib import nullcontext
@@ -19,10 +19,10 @@ from nerf_lightning.utils.progress import is_interactive
 
 
 def prepare_process(cfg: DictConfig, may_compile: bool = False) -> None:
-    """Sets what applies to the whole process; with `may_compile`, for a compiled step if the run asks for one.
+    """Sets process-wide state; with `may_compile`, reference kernels if the run compiles its steps.
 
     Raises:
-        InputError: for kernels that there are not.
+        InputError: for unknown kernels.
     """
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
@@ -33,7 +33,7 @@ def prepare_process(cfg: DictConfig, may_compile: bool = False) -> None:
 
 
 def check_processes(trainer: L.Trainer) -> None:
-    """Refuses what several processes cannot share.
+    """Checks that the trainer's processes can share the run.
 
     Raises:
         InputError: for a sweep whose jobs would start further processes.
@@ -49,10 +49,10 @@ def check_processes(trainer: L.Trainer) -> None:
 def warm_up(system: System, data: DataModule, device: torch.device) -> None:
     """Runs a small step on a copy, so that kernels are compiled before the clock starts.
 
-    A CPU's kernels are compiled once and cached; those of `compile`, in every process.
+    CPU kernels are compiled once and cached; with `compile`, in every process.
     """
     is_compiled = device.type == "cpu" or system.compile_backend is not None
-    note = " (the first time they are compiled: half a minute)" if is_compiled else ""
+    note = " (compiled on first use: half a minute)" if is_compiled else ""
     console = Console()
-    with console.status(f"getting the kernels ready{note}") if is_interactive(console) else nullcontext():
+    with console.status(f"preparing kernels{note}") if is_interactive(console) else nullcontext():
         copy.deepcopy(system).to(device).warm_up_kernels(data.make_warmup_batch())

@@ -1,4 +1,4 @@
-"""What a resumed run goes on with: its configuration, checkpoint and photos."""
+"""Resuming: configuration, checkpoint and photos of the run to continue."""
 
 from pathlib import Path
 
@@ -16,14 +16,14 @@ from nerf_lightning.runs.scene_file import read_scene_file
 
 
 def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
-    """The configuration of the run in `folder` with this command line's overrides on top, and its last checkpoint."""
+    """Configuration of the run in `folder` with this command line's overrides, and its last checkpoint."""
     saved = load_config(folder)
     checkpoint = folder / "checkpoints" / "last.ckpt"
-    read_checkpoint(checkpoint, RESUME_KEYS)  # fails in one line before anything starts, if it is broken
-    given = [override.partition("=")[0].lstrip("+") for override in HydraConfig.get().overrides.task]
-    if "dataset.path" in given and cfg.dataset.path is not None:
+    read_checkpoint(checkpoint, RESUME_KEYS)  # raises before anything starts, if it is damaged
+    overridden_keys = [override.partition("=")[0].lstrip("+") for override in HydraConfig.get().overrides.task]
+    if "dataset.path" in overridden_keys and cfg.dataset.path is not None:
         saved = replace_photos(saved, cfg.dataset.path)
-    for key in given:
+    for key in overridden_keys:
         if key == "resume":
             continue
         if OmegaConf.select(saved, key, default=key) is key:
@@ -35,13 +35,13 @@ def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
             escape_interpolations(resolve_config(value) if isinstance(value, DictConfig) else value),
             merge=False,
         )
-    if "device" in given:  # the trainer's was resolved when the run began
+    if "device" in overridden_keys:  # the trainer's was resolved when the run began
         OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
     return saved, checkpoint
 
 
 def load_data(cfg: DictConfig, scene: Scene | None, resumed: Path | None) -> DataModule:
-    """The data to train on: a loaded scene, that of a resumed run in its frame, or the configuration's."""
+    """Training data: a loaded scene, that of a resumed run in its frame, or the configuration's."""
     if resumed is not None:
         return reload_data(cfg, read_scene_file(resumed), cfg.dataset.get("path"), corrected=False)
     if scene is None:

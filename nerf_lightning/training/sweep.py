@@ -1,4 +1,4 @@
-"""Sweeps as a whole: a table of all jobs, and what became of them. Imports nothing heavy."""
+"""Sweep report: a table of all jobs, their comparison, and the exit code. Imports nothing heavy."""
 
 import csv
 import sys
@@ -16,11 +16,11 @@ from nerf_lightning.utils.files import atomic_write
 TABLE_FILE = "sweep.csv"
 METRIC_COLUMNS = ("psnr", "ssim", "train_seconds", "steps", "parameters", "artifact_bytes")
 ERROR_FILE = "error.txt"
-"""In the folder of a job that failed, or was refused as another run's results are there."""
+"""In the folder of a job that failed, or was refused because of another run's results."""
 
 
 def write_table(root: Path, runs: Sequence[RunSummary]) -> None:
-    """Writes sweep.csv, a line for each job."""
+    """Writes sweep.csv, one row per job."""
     with atomic_write(root / TABLE_FILE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         options = find_varying_options(runs)
@@ -32,7 +32,7 @@ def write_table(root: Path, runs: Sequence[RunSummary]) -> None:
 
 
 class SweepReport(Callback):
-    """Hydra's hooks around the jobs: their folder, then their comparison, and exit code 1 unless all are done."""
+    """Hydra callback: prints the sweep's folder, then compares the jobs, and exits with code 1 unless all are done."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         # Names come from this process's command line: resolved here, they are cached for jobs in other processes.
@@ -44,15 +44,15 @@ class SweepReport(Callback):
 
         root = Path(config.hydra.sweep.dir)
         runs = find_runs(root)
-        left = [
+        unfinished = [
             run for run in runs if run.status not in (*FINISHED, "stopped_early") or (run.folder / ERROR_FILE).exists()
         ]
         try:
             write_comparison(runs, root, read_references(PUBLISHED_FILE))
-            print(f"{root / TABLE_FILE}: a line for each job")
+            print(f"{root / TABLE_FILE}: one row per job")
         finally:
-            if left:
-                names = ", ".join(f"{run.folder.relative_to(root)} ({run.status})" for run in left)
-                line = f"{len(left)} of {len(runs)} jobs are not done: {names}; the same command continues"
+            if unfinished:
+                names = ", ".join(f"{run.folder.relative_to(root)} ({run.status})" for run in unfinished)
+                line = f"{len(unfinished)} of {len(runs)} jobs are not done: {names}; the same command continues"
                 print(f"nerf_lightning: {line}", file=sys.stderr)
                 sys.exit(1)

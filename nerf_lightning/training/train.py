@@ -1,4 +1,4 @@
-"""One training run, from a composed configuration to the files in its folder."""
+"""Training: one run, from a composed configuration to the files in its folder."""
 
 import logging
 import math
@@ -48,7 +48,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """What a run is made of."""
+    """Objects of a training run."""
 
     cfg: DictConfig
     folder: Path
@@ -56,19 +56,19 @@ class TrainingRun:
     system: System
     trainer: L.Trainer
     warnings: list[str]
-    """What is doubtful about the photos."""
+    """Issues found in the photos."""
 
 
 @finish_wandb()
 def train(
     cfg: DictConfig, checkpoint: Path | None = None, folder: Path | None = None, scene: Scene | None = None
 ) -> float:
-    """Prepares, builds, fits and summarizes. Returns the held-out PSNR in dB.
+    """Trains and evaluates a run. Returns the held-out PSNR in dB.
 
     Args:
-        cfg: the configuration; with `resume`, the resumed run's takes its place.
+        cfg: the configuration; with `resume`, replaced by the resumed run's.
         checkpoint: state of a run with the same configuration, to continue from.
-        folder: where to write, which the caller owns (see `runs/owner.py`); None takes Hydra's.
+        folder: where to write, locked by the caller (see `runs/run_lock.py`); None takes Hydra's.
         scene: to train on, if already loaded; None loads the configuration's.
 
     Raises:
@@ -88,7 +88,7 @@ def train(
         in_sweep = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
         live.finish(results["psnr"], keep_open=not in_sweep)
     quality: float | None = results["psnr"]
-    return math.nan if quality is None else quality  # views of a field that has broken down may have none
+    return math.nan if quality is None else quality  # a diverged field may have none
 
 
 def prepare(cfg: DictConfig) -> torch.device:
@@ -105,12 +105,12 @@ def prepare(cfg: DictConfig) -> torch.device:
 def build_run(
     cfg: DictConfig, data: DataModule, device: torch.device, folder: Path, checkpoint: Path | None
 ) -> TrainingRun:
-    """Makes system and trainer for the data, checks that they fit each other, and empties the folder unless a run continues."""
+    """Builds system and trainer, checks that they fit the data, and empties the folder unless a run continues."""
     data.scale_batch(get_limits(cfg, device).batch_scale)
-    doubts = data.find_issues(has_pose_refinement(cfg))
-    for doubt in doubts:
-        log.warning("%s: %s", data.scene.name, doubt.text)
-    system = prepare_system(cfg, data, device, any(doubt.has_wrong_poses for doubt in doubts))
+    issues = data.find_issues(has_pose_refinement(cfg))
+    for issue in issues:
+        log.warning("%s: %s", data.scene.name, issue.text)
+    system = prepare_system(cfg, data, device, any(issue.has_wrong_poses for issue in issues))
     trainer = build_trainer(cfg, folder, device)
     check_processes(trainer)
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
@@ -119,30 +119,30 @@ def build_run(
     if trainer.is_global_zero:
         if checkpoint is None:
             delete_run_outputs(folder)
-        first = LambdaCallback(on_train_start=lambda *_: write_description(cfg, data, folder))
-        trainer.callbacks.insert(0, first)  # type: ignore[attr-defined]
+        description = LambdaCallback(on_train_start=lambda *_: write_description(cfg, data, folder))
+        trainer.callbacks.insert(0, description)  # type: ignore[attr-defined]
     with trainer.precision_plugin.train_step_context():
         warm_up(system, data, trainer.strategy.root_device)
-    return TrainingRun(cfg, folder, data, system, trainer, [doubt.text for doubt in doubts])
+    return TrainingRun(cfg, folder, data, system, trainer, [issue.text for issue in issues])
 
 
 def write_description(cfg: DictConfig, data: DataModule, folder: Path) -> None:
-    """Writes what opens a run again, once its training begins: a resumed run stays as it was where its state does not fit."""
+    """Writes what reopens a run, once training starts: a run whose state does not fit stays as it was."""
     save_config(cfg, folder)
     save_scene(data, folder)
     link_latest(folder)
 
 
-def prepare_system(cfg: DictConfig, data: DataModule, device: torch.device, poses_are_off: bool) -> System:
-    """The system to train.
+def prepare_system(cfg: DictConfig, data: DataModule, device: torch.device, has_wrong_poses: bool) -> System:
+    """Builds the system to train.
 
     Raises:
-        InputError: it needs more memory than is free, trained at its largest, or does not fit the data.
+        InputError: if it needs more memory than is free, at its largest, or does not fit the data.
     """
     system = build_system(cfg, get_metadata(data), device)
-    what = "numbers, with their gradients and moments,"
-    check_memory("config", "model", what, system.field.training_bytes, "choose a smaller one", device)
-    if system.corrections is not None and poses_are_off:
+    contents = "numbers, with their gradients and moments,"
+    check_memory("config", "model", contents, system.field.training_bytes, "choose a smaller one", device)
+    if system.corrections is not None and has_wrong_poses:
         system.corrections.enable_poses()
     if system.field.size_message:
         log.info("model: %s", system.field.size_message)
@@ -150,7 +150,7 @@ def prepare_system(cfg: DictConfig, data: DataModule, device: torch.device, pose
 
 
 def fit_and_test(run: TrainingRun, checkpoint: Path | None) -> dict[str, Any]:
-    """Trains, measures and writes results.json, also of a run that ends early. Returns its content."""
+    """Trains, evaluates and writes results.json, also of a run that ends early. Returns its content."""
     trainer, path = run.trainer, run.folder / "results.json"
     options = trainer, run.system, run.cfg.method, run.cfg.seed, run.warnings
     try:
@@ -158,7 +158,7 @@ def fit_and_test(run: TrainingRun, checkpoint: Path | None) -> dict[str, Any]:
         trainer.test(run.system, run.data, verbose=False)
     except BaseException as error:
         if trainer.is_global_zero and has_trained(trainer, error):
-            with suppress(DiskFullError):  # on a full disk what happened first is to be told
+            with suppress(DiskFullError):  # report the first error, not a full disk
                 write_json(path, summarize_run(*options, error))
         raise
     results = summarize_run(*options)
@@ -168,10 +168,10 @@ def fit_and_test(run: TrainingRun, checkpoint: Path | None) -> dict[str, Any]:
 
 
 def fit(run: TrainingRun, checkpoint: Path | None) -> None:
-    """Trains, from a checkpoint if there is one.
+    """Trains, from a checkpoint if given.
 
     Raises:
-        InputError: where the checkpoint does not fit the run.
+        InputError: if the checkpoint does not fit the run.
     """
     try:
         run.trainer.fit(run.system, run.data, ckpt_path=checkpoint, weights_only=True)
@@ -180,19 +180,19 @@ def fit(run: TrainingRun, checkpoint: Path | None) -> None:
             delete_run_outputs(run.folder)
         if checkpoint is None or run.system.state.clock.has_started or isinstance(error, InputError):
             raise
-        found = f"{type(error).__name__}: {error}"  # only the checkpoint has been at work yet
-        raise InputError(checkpoint, "", f"cannot be resumed ({found})", hint="start the run anew") from error
+        problem = f"cannot be resumed ({type(error).__name__}: {error})"  # nothing but the checkpoint was read yet
+        raise InputError(checkpoint, "", problem, hint="start the run anew") from error
 
 
 def has_trained(trainer: L.Trainer, error: BaseException) -> bool:
-    """Whether an error came after the start of training, and not from a first step that did not fit into memory."""
+    """Whether an error came after the start of training, and not from a first step that ran out of memory."""
     return Budget.find(trainer).state.clock.has_started and not (
         trainer.global_step == 0 and out_of_memory_error(error)
     )
 
 
 def summarize(run: TrainingRun, results: dict[str, Any]) -> None:
-    """Saves corrected cameras, logs the final figures, and prints the outcome."""
+    """Saves refined cameras, logs the final metrics, and prints the results."""
     report_photos(run.system, run.data, results, run.folder)
     if run.trainer.logger is not None:
         log_summary(run.trainer.logger, resolve_config(run.cfg), results)

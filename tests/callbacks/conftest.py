@@ -16,7 +16,7 @@ from nerf_lightning.system import NeRF2D, StepStats, ViewResult, constant
 
 
 class Clock:
-    """Stands in for time.perf_counter; moves only when told."""
+    """Fake time.perf_counter that only `wait` advances."""
 
     now = 100.0
 
@@ -44,7 +44,7 @@ class GrayField(PictureField):
 
 
 class ScriptedSystem(NeRF2D):
-    """Measures what it is told, and notes what it was asked."""
+    """Fake system with given PSNR values, which records the views it evaluates."""
 
     def __init__(self):
         super().__init__(GrayField(), functools.partial(torch.optim.SGD, lr=0.1), constant)
@@ -71,7 +71,7 @@ class Data(PixelDataModule):
     def __init__(self, scene: Picture):
         super().__init__(scene)
         self.subsets: list[PixelSubset] = []
-        """What was asked of each view."""
+        """Subset requested of each view."""
 
     def get_held_out_view(self, view: int, subset: PixelSubset = ALL_PIXELS) -> int:
         self.subsets.append(subset)
@@ -83,7 +83,7 @@ class Data(PixelDataModule):
 
 @pytest.fixture
 def trainer_with(tmp_path: Path) -> Callable[..., L.Trainer]:
-    """A trainer with the given callbacks and nothing behind it."""
+    """A fake trainer with the given callbacks."""
 
     def make(*callbacks: L.Callback) -> L.Trainer:
         trainer = Mock(spec=L.Trainer)

@@ -1,4 +1,4 @@
-"""The guard: what it notices, what it does, and that it leaves good training alone."""
+"""Divergence recovery: what it detects, what it does, and that it leaves healthy training alone."""
 
 import functools
 import json
@@ -23,7 +23,7 @@ from nerf_lightning.utils.libraries import silence_lightning
 
 
 class Blob(PictureField):
-    """A picture of its own, pixel by pixel: learns quickly with any rate below one."""
+    """A free colour per pixel: learns quickly at any learning rate below one."""
 
     def __init__(self):
         super().__init__((8, 8))
@@ -41,7 +41,7 @@ def stripes() -> Picture:
 
 
 class BrokenSystem(NeRF2D):
-    """A system that goes wrong at a step, as told."""
+    """A system that breaks at a step in a given way."""
 
     def __init__(self, failure: str, failure_step: int, rate: float = 20.0, field: PictureField | None = None):
         super().__init__(field or Blob(), functools.partial(torch.optim.SGD, lr=rate), constant)
@@ -77,7 +77,7 @@ class BrokenSystem(NeRF2D):
 
     @torch.no_grad()
     def set_error(self, error: float) -> None:
-        """Makes the field show the stripes with so much of the error that their mean colour has."""
+        """Sets the field to the stripes with a given fraction of their mean colour's error."""
         truth = torch.zeros(8, 8, 3)
         truth[::2] = 1
         self.field.colours.copy_((0.5 + (1 - error**0.5) * (truth - 0.5)).view(64, 3))
@@ -127,8 +127,8 @@ def test_recovery_broken_step_restores_last_good_weights(
 @pytest.mark.parametrize(
     ("failure", "words", "action"),
     [
-        ("rise a little", "times that of one plain colour, and has stayed above that since", "last good weights"),
-        ("hover", "times that of one plain colour", "started again with 0.2 times"),
+        ("rise a little", "times that of a constant colour, and has stayed above that since", "last good weights"),
+        ("hover", "times that of a constant colour", "started again with 0.2 times"),
     ],
 )
 def test_recovery_stalled_training_restarts(failure: str, words: str, action: str, tmp_path: Path):
@@ -155,7 +155,7 @@ def test_recovery_after_max_restarts_gives_up(tmp_path: Path, capsys: pytest.Cap
     run(BrokenSystem("no gradient", 0), recovery, tmp_path)
     assert len(recovery.recoveries) == 2 and all("no gradient" in restart.cause for restart in recovery.recoveries)
     assert recovery.lr_factor == pytest.approx(LR_CUT**2)
-    assert "given up after 2 attempts" in capsys.readouterr().out
+    assert "giving up after 2 restarts" in capsys.readouterr().out
 
 
 def test_recovery_constant_image_is_no_failure(tmp_path: Path):
@@ -166,7 +166,7 @@ def test_recovery_constant_image_is_no_failure(tmp_path: Path):
 
 
 def test_recovery_dead_relu_becomes_softplus(tmp_path: Path):
-    """Of the seeds 0 to 7 this one dies: its density is zero everywhere, and no gradient comes back."""
+    """The one of seeds 0 to 7 that dies: zero density everywhere, and no gradient."""
     save_npz(make_object_scene(MARBLE, (1.0, 1.0, 1.0)), tmp_path / "scene.npz")
     given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", *METHODS["relu mlp"].options, "seed=7"]
     train(compose_config([*given, "threads=1", "budget.steps=100", "callbacks.orbit.frames=0"], tmp_path))

@@ -1,4 +1,4 @@
-"""When more training is not worth its time."""
+"""Early stopping at a plateau."""
 
 import json
 import math
@@ -14,7 +14,7 @@ from nerf_lightning.training.train import train
 
 
 def find_plateau(plateau: PlateauDetector, quality, until: float = 1.0) -> float | None:
-    """What was spent when a plateau was told, going along a curve of dB."""
+    """Fraction spent at the first plateau along a PSNR curve."""
     spent = FIRST_MEASUREMENT
     while spent <= until:
         if plateau.is_due(spent) and plateau.add_measurement(spent, quality(spent)):

@@ -66,7 +66,7 @@ def test_picture_report_after_test_writes_charts(clock, system, trainer_with, tm
 @pytest.mark.parametrize(
     ("size", "most", "expected"), [((40, 60), 60, (40, 60)), ((40, 60), 30, (20, 30)), ((2, 60), 6, (1, 6))]
 )
-def test_narrowed_wide_image_keeps_aspect_ratio(size: tuple[int, int], most: int, expected: tuple[int, int]):
+def test_limit_width_wide_image_keeps_aspect_ratio(size: tuple[int, int], most: int, expected: tuple[int, int]):
     assert limit_width(np.zeros((*size, 3), np.uint8), most).shape == (*expected, 3)
 
 
@@ -137,7 +137,7 @@ class Ramp(PictureField):
 
 
 def ramp(width: int, height: int) -> np.ndarray:
-    """What `Ramp` looks like in so many pixels."""
+    """`Ramp` rendered at a given size."""
     red, green = ((np.arange(n) + 0.5) / n for n in (width, height))
     colours = np.stack(np.broadcast_arrays(red, green[:, None], 0.5), axis=-1)
     return np.rint(colours.astype(np.float32) * 255).astype(np.uint8)

@@ -25,12 +25,12 @@ from nerf_lightning.training.train import train
 
 @dataclass
 class TrainingLog:
-    """What a run showed, and what was true."""
+    """What a run showed, and the true values."""
 
     times: list[tuple[float, float]]
     """Seconds left, as shown and as they really were."""
     subjects: set[str]
-    """What it said that it rendered, with N for each number."""
+    """Subjects shown, with N for each number."""
     rendering: float
     """Seconds of rendering."""
     results: dict[str, Any]
@@ -68,7 +68,7 @@ def test_render_timer_seconds_per_pixel_follow_last_views(clock):
 def simulated(
     clock: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> Callable[[int, float, float], TrainingLog]:
-    """Trains for 180 s of a clock that only steps and rendered pixels move: a step takes a second."""
+    """Trains for 180 s of a fake clock that steps (1 s each) and rendered pixels advance."""
     monkeypatch.setattr(time, "monotonic", clock)
     monkeypatch.setattr("nerf_lightning.training.train.warm_up", lambda *given: None)
 
@@ -112,7 +112,7 @@ def simulated(
 @pytest.mark.parametrize(
     ("side", "pixel_seconds", "fog", "seconds", "rows"),
     [
-        # 10 snapshots, 5 times 8 views, 8 views, 60 frames of the orbit, and the first look.
+        # 10 snapshots, 5 times 8 views, 8 views, 60 frames of the orbit, and the first view.
         (32, 2e-5, 4.0, 119 * 32 * 32 * 2e-5, 1.0),
         (512, 2e-4, 1.0, 180.0, 0.25),  # the held-out views take 419 s
     ],
@@ -123,7 +123,7 @@ def test_rendering_slow_field_takes_at_most_training_time(
     log = simulated(side, pixel_seconds, fog)
     assert log.rendering == pytest.approx(seconds, rel=0.1)
     assert log.results["rows_measured"] == pytest.approx(rows, abs=0.01)
-    assert max(true for _, true in log.times) > 170, "told from the tenth second on"
+    assert max(true for _, true in log.times) > 170, "shown from the tenth second on"
     assert not [(left, true) for left, true in log.times if abs(left - true) > max(0.25 * true, 2.0)]
     if rows < 1:
         names = {"snapshot", "held-out view N of N", "orbit, frame N of N"}

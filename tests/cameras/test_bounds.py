@@ -18,7 +18,7 @@ AXES = torch.cat([torch.eye(3), -torch.eye(3)])
 RAYS = {
     "random": lambda: sample_random_rays(200),
     "parallel to an axis, through": lambda: Rays(BOX.mean(0) - 4 * AXES, AXES),
-    "parallel to an axis, beside": lambda: Rays(BOX[1] + 0.1 - 4 * AXES, AXES),
+    "parallel to an axis, outside": lambda: Rays(BOX[1] + 0.1 - 4 * AXES, AXES),
     "inside": lambda: Rays(BOX[0] + torch.rand(100, 3) * (BOX[1] - BOX[0]), sample_random_rays(100).directions),
     "leaving": lambda: Rays(BOX[1] + 0.1 + torch.rand(50, 3), sample_random_rays(50).directions.abs()),
 }
@@ -40,7 +40,7 @@ def test_near_far_of_random_rays_agrees_with_marching(kind):
             assert last - 1e-4 <= far[ray] <= last + step + 1e-4
         else:
             assert far[ray] - near[ray] < step
-    if kind in ("parallel to an axis, beside", "leaving"):
+    if kind in ("parallel to an axis, outside", "leaving"):
         assert (near >= far).all()
     if kind == "inside":
         assert (near == 0).all() and (far > 0).all()
@@ -83,7 +83,7 @@ def rays_along_x(*starts: list[float]) -> Rays:
 
 
 def test_s_to_t_unbounded_steps_grow_outside_the_box():
-    """A cube of half-size 2, met, begun inside of, missed, and far behind: by hand."""
+    """A cube of half-size 2, hit, entered from inside, missed, and far behind: by hand."""
     cube = Bounds(torch.tensor([[-2.0, -2, -2], [2, 2, 2]]), unbounded=True)
     rays = rays_along_x([-8.0, 0, 0], [1.0, 0, 0], [-8.0, 5, 0], [30.0, 0, 0])
     torch.testing.assert_close(

@@ -1,4 +1,4 @@
-"""How cameras are laid out, against captures whose layout is known, in any frame, unit and order."""
+"""Camera layouts of known captures, invariant to frame, unit and order."""
 
 import pytest
 import torch
@@ -38,7 +38,7 @@ def test_classify_layout_in_any_frame_and_unit_is_the_same(c2w: torch.Tensor, la
 
 
 def test_classify_layout_with_points_separates_pan_and_walk():
-    """The same poses at a table's and at a valley's distance."""
+    """The same poses with points at a table's and at a valley's distance."""
     c2w = pan(0.3)
     directions = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)).double()
     directions = directions / directions.norm(dim=1, keepdim=True)

@@ -1,4 +1,4 @@
-"""Photos of all directions, 360 degrees wide and 180 high."""
+"""Equirectangular panoramas, 360 degrees wide and 180 high."""
 
 import math
 
@@ -20,7 +20,7 @@ def panoramas(c2w: torch.Tensor, width: int = WIDTH, height: int = HEIGHT) -> Ca
 
 
 def random_pose_cameras() -> Cameras:
-    """One, that is turned and stands somewhere."""
+    """One panorama with a random pose."""
     eye, target = torch.tensor([0.3, -0.2, 0.5]), torch.tensor([1.0, 2.0, 0.1])
     return panoramas(look_at(eye, target, torch.tensor([0.1, 0.2, 1.0]))[None])
 

@@ -1,4 +1,4 @@
-"""Rays through lenses, against OpenCV's own."""
+"""Rays through lenses, against OpenCV."""
 
 import cv2
 import numpy as np
@@ -43,7 +43,7 @@ def opencv_distortion(name: str, row: torch.Tensor, col: torch.Tensor) -> np.nda
 def test_generate_rays_distorted_agree_with_opencv_and_project(name: str):
     row, col = torch.randint(HEIGHT, (5000,)), torch.randint(WIDTH, (5000,))
     rays = make_lens_cameras(name).generate_rays(torch.zeros_like(row), row, col).directions.double().numpy()
-    expected = opencv_directions(name, row, col)
+    expected = opencv_distortion(name, row, col)
     expected /= np.linalg.norm(expected, axis=1, keepdims=True)
     angle = np.linalg.norm(np.cross(rays, expected), axis=1)
     assert (np.sum(rays * expected, axis=1) > 0).all() and angle.max() < 1e-5

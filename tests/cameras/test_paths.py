@@ -1,4 +1,4 @@
-"""Paths stay where photos were taken, whatever the layout, and never hold a degenerate pose."""
+"""Camera paths stay near the photos for every layout, without degenerate poses."""
 
 import math
 

@@ -48,7 +48,7 @@ def test_make_circle_poses_is_a_level_circle(up, elevation):
 
 @pytest.mark.parametrize(("quarters", "fraction", "degrees"), [([0], 0.2, 15), ([1], 0.5, 5), ([0, 1, 0, 3, 0], 1, 2)])
 def test_estimate_up_of_rotated_photos_finds_up(quarters: list[int], fraction: float, degrees: float):
-    """Cameras around a subject, held upright or on their side, and not quite level."""
+    """Cameras around a subject, in portrait or landscape, and not quite level."""
     up = unit(0.3, 0.8, -0.5).float()
     c2w = make_circle_poses(torch.tensor([0.4, -0.3, 0.2]), up, 2.0, 0.5, 40)[: int(fraction * 40)]
     angle = torch.tensor(quarters * 40)[: len(c2w)] * math.pi / 2 + 0.03 * torch.randn(len(c2w))

@@ -12,7 +12,7 @@ from tests.helpers.tag_views import TAG_SIZE
 
 @pytest.fixture(scope="session")
 def packed(tag_capture: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Capture]:
-    """What a capture of it writes, in a folder, and returns."""
+    """Output folder and result of a capture."""
 
     def make(folder: Path) -> tuple[Path, Capture]:
         photos = tag_capture[0] / "calibration", tag_capture[0] / "photos"

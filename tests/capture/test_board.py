@@ -15,7 +15,7 @@ from tests.helpers.tag_views import make_pose
 LENS = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0)
 BOARD, TAG, FAMILY = Board(5, 7, 0.03), 0.022, "DICT_4X4_50"
 CELL = 80
-"""Pixels a square in the print."""
+"""Pixels per square in the print."""
 
 
 def printed(board: Board, legacy: bool = False) -> np.ndarray:
@@ -27,7 +27,7 @@ def printed(board: Board, legacy: bool = False) -> np.ndarray:
 
 
 def photo(print_: np.ndarray, board: Board, c2w: np.ndarray) -> np.ndarray:
-    """The print as a camera sees it, x to the right and y up from its middle, without distortion."""
+    """Photo of the print without distortion; x right and y up from its centre."""
     w2c = invert_pose(c2w)
     height, width = print_.shape
     step = board.square / CELL

@@ -138,7 +138,7 @@ def test_capture_with_bad_option_names_it(few_photos: dict[str, Path], tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("photo", "words"), [((300, 400), "no tag"), ((400, 300), "a.png.*held the other way"), (None, "a.png")]
+    ("photo", "words"), [((300, 400), "no tag"), ((400, 300), "a.png.*rotated by 90 degrees"), (None, "a.png")]
 )
 def test_capture_with_bad_photo_names_it(few_photos: dict[str, Path], tmp_path: Path, photo: tuple | None, words: str):
     file = tmp_path / "a.png"
@@ -193,7 +193,7 @@ def test_capture_scene_with_hidden_tags_registers_photos_by_texture(tag_capture:
 
 @pytest.mark.real_data
 def test_capture_scene_of_real_photos_registers_all(real_data: Path, tmp_path: Path):
-    """Six tags on a curled page, then an object beside one of them."""
+    """Six tags on a curled page, then an object next to one of them."""
     folder = real_data / "aruco_capture"
     found = capture_scene(folder / "calibration", folder / "object", 0.055, tmp_path / "scene.npz")
     assert found.calibration.rms < 2 and not found.calibration.excluded

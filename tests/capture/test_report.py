@@ -1,4 +1,4 @@
-"""The report's pictures of a small capture."""
+"""The report's figures of a small capture."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""nerf_lightning check: what is wrong with photos is named, what is right is not."""
+"""The check command: issues of damaged photos are reported, good photos are not."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -57,7 +57,7 @@ def test_assess_photos_of_damaged_photos_names_each_issue(views: Views, tmp_path
         "0002.png": ["blurred"],
         "0005.png": ["over-exposed", "brighter than the others"],
         "0007.png": ["darker than the others"],
-        "0011.png": ["doubled"],
+        "0011.png": ["duplicate"],
     }
 
 
@@ -78,7 +78,7 @@ def test_render_check_page_shows_photos_worst_first(views: Views, tmp_path: Path
     )
     text = page.read_text(encoding="utf-8")
     assert "14 to train on, 2 held out" in text and "16 of 64 x 64" in text
-    assert "1 photos have no place in the model, 9999.png" in text and "<b>" not in text.split("<figure")[0]
+    assert "ignoring 1 photos that are not in the model: 9999.png" in text and "<b>" not in text.split("<figure")[0]
     assert "a &lt;b&gt;" in text and "http" not in text.replace("http-equiv", "")
     figures = text.split("<figure")[1:]
     assert len(figures) == 16 and "0009.png" in figures[0] and "0000.png" in figures[1]
@@ -89,8 +89,8 @@ def test_plot_camera_map_shows_points_and_box(views: Views, tmp_path: Path):
     scene = open_scene(str(capture(tmp_path, views, {}, np.random.default_rng(0).normal(0, 0.3, (300, 3)))))
     figure = plot_camera_map(list(enumerate(scene.train.cameras.c2w.double().numpy())), scene, {})
     assert scene.points is not None
-    above, beside = figure.axes
-    for axes, up in ((above, 1), (beside, 2)):
+    above, side = figure.axes
+    for axes, up in ((above, 1), (side, 2)):
         lines = [np.asarray(line.get_xydata()) for line in axes.lines]
         assert any(len(xy) == 300 and np.allclose(xy, scene.points[:, [0, up]]) for xy in lines)
         assert any(np.allclose(xy[[0, 2]], scene.bounds.aabb[:, [0, up]]) for xy in lines if len(xy) == 5)

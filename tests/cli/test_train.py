@@ -87,7 +87,7 @@ def test_lego_missing_file_falls_back_to_bricks(run_cli):
     code, out, err = run_cli("+experiment=lego", "dataset.download=false", *small)
     assert code == 0, err
     (warning,) = [line for line in (out + err).splitlines() if "WARNING" in line]
-    assert "data/lego_200x200.npz is not there" in warning
+    assert "data/lego_200x200.npz does not exist" in warning
     assert "bricks" in warning
     assert any(line.startswith("bricks: ") for line in out.splitlines())
 

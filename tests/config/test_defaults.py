@@ -12,7 +12,7 @@ from nerf_lightning.config import conf_dir
 
 
 def targets(node: Any) -> Iterator[dict[str, Any]]:
-    """All nodes of a file that name something of this package to build."""
+    """All nodes of a file with a target in this package."""
     if isinstance(node, dict):
         if str(node.get("_target_", "")).startswith("nerf_lightning."):
             yield node
@@ -27,10 +27,10 @@ def test_conf_defaults_match_signatures():
             for key, value in node.items():
                 if not key.startswith("_") and "$" not in str(value) and key != "url":  # which has no default
                     written[node["_target_"], key].append(value)
-    apart = []
+    differing = []
     for (target, key), values in written.items():
         default = inspect.signature(get_object(target)).parameters[key].default
         # Two files may be two ways of one target, as sampler/uniform and sampler/stratified are.
         if default is not inspect.Parameter.empty and default not in values:
-            apart.append(f"{target}({key}={default!r}), conf/ {values}")
-    assert len(written) > 90 and not apart, "\n".join(apart)
+            differing.append(f"{target}({key}={default!r}), conf/ {values}")
+    assert len(written) > 90 and not differing, "\n".join(differing)

@@ -36,7 +36,7 @@ ODD = (
 
 
 def values_of(argument: str) -> list[object]:
-    """What jobs find at the key that an argument sets, after Hydra and OmegaConf have read it."""
+    """Values of the key that an argument sets, by job, as Hydra and OmegaConf parse them."""
     parsed = OverridesParser.create().parse_override(argument)
     if not parsed.is_sweep_override():
         return [OmegaConf.create({"value": parsed.value()}).value]

@@ -1,4 +1,4 @@
-"""Folders named after what was asked for."""
+"""Folders named after the command line."""
 
 import pytest
 

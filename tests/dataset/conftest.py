@@ -1,4 +1,4 @@
-"""A scene small enough to write in every format: a coloured ball off the origin, exact silhouettes, oblong pictures."""
+"""A small scene in every format: a coloured ball off the origin, exact silhouettes, rectangular images."""
 
 import math
 from collections.abc import Callable

@@ -30,7 +30,7 @@ def make_images() -> np.ndarray:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """RGBA, 8x6; an OpenGL camera with identity rotation stands at (0, 0, 5): right is x, up is y, it looks along -z."""
+    """RGBA, 8x6; an OpenGL camera with identity rotation at (0, 0, 5): right is x, up is y, viewing along -z."""
     pose = np.eye(4)
     pose[2, 3] = 5.0
     images = make_images()
@@ -69,7 +69,7 @@ def test_load_blender_split_without_photos_is_the_orbit(folder: Path):
 
 
 def test_load_blender_splits_follow_the_files(folder: Path):
-    """Test photos are kept apart from val, or held out instead of it; without both, some training photos are held out."""
+    """Test photos are separate from val, or held out instead of it; without both, some training photos are held out."""
     write_split(folder, "test", make_images(), np.stack([np.eye(4)] * 3))
     scene = load_blender(folder)
     assert (len(scene.train), len(scene.val), len(scene.test)) == (2, 1, 3)

@@ -1,4 +1,4 @@
-"""COLMAP and LLFF folders: the same scene as transforms.json has."""
+"""COLMAP and LLFF folders give the same scene as transforms.json."""
 
 import logging
 from collections.abc import Callable
@@ -57,7 +57,7 @@ def test_open_scene_model_folder_means_its_scene(views: Views, tmp_path: Path, c
     )
     with caplog.at_level(logging.WARNING):
         scene = open_scene(str(folder))
-    assert "sparse/1: the largest model; others: 0" in caplog.text
+    assert "sparse/1: using the largest model; others: 0" in caplog.text
     assert scene.name == "scene" and len(scene.train) == 15
     for below in ("colmap/sparse/1", "colmap/sparse"):
         assert_same_scene(scene, open_scene(str(folder / below)))
@@ -78,14 +78,14 @@ def test_make_intrinsics_agrees_with_pycolmap():
 
 
 def rays_of(intrinsics: Intrinsics, uv: np.ndarray) -> np.ndarray:
-    """Directions of places in a photo, camera frame."""
+    """Directions of pixels in the camera frame."""
     seen = torch.from_numpy((uv - (intrinsics.cx, intrinsics.cy)) / (intrinsics.fx, intrinsics.fy))
     flat = undistort(seen, torch.tensor([intrinsics.distortion], dtype=torch.float64))
     return normalized_to_directions(flat, torch.tensor([intrinsics.projection])).numpy()
 
 
 def test_open_scene_points_and_depths_decide_near(views: Views, tmp_path: Path):
-    """Photos on grey noise, so that the scene is unbounded; cameras stand 4 units from the middle."""
+    """Photos on grey noise, so that the scene is unbounded; cameras are 4 units from the centre."""
     rng = np.random.default_rng(0)
     noise = torch.from_numpy(rng.integers(0, 255, (*views.images.shape[:3], 3), np.uint8))
     names = write_photos(tmp_path / "images", Views.from_images(noise, views.cameras))
@@ -103,7 +103,7 @@ def test_open_scene_points_and_depths_decide_near(views: Views, tmp_path: Path):
 
 
 def test_is_invertible_extreme_lens_is_refused():
-    """Their borders unfold in double precision; between, or in single precision, rays go elsewhere."""
+    """Invertible on the borders in float64, but not in between, or not in float32."""
     for focal, k1 in ((1e5, 900.0), (6000.0, -0.3)):
         assert Intrinsics(6000, 4000, focal, focal, 3000, 2000, Distortion(k1=k1)).is_invertible(), "strong, unfolded"
     fisheye = Intrinsics(640, 480, 111.0, 111.0, 320, 240, Distortion(k1=6e9, d2=-6e12), Projection.FISHEYE)

@@ -26,7 +26,7 @@ def cut(name: str, size: int) -> Spoil:
 
 
 def put(name: str, at: int, form: str, *values: object) -> Spoil:
-    """Overwrites some bytes."""
+    """Overwrites bytes."""
 
     def apply(scene: Path) -> None:
         content = bytearray((scene / name).read_bytes())
@@ -54,7 +54,7 @@ def no_photos(scene: Path) -> None:
 
 
 def entries(**changes: object) -> Spoil:
-    """Of the .npz file; None removes one, a function gets the old one."""
+    """Changes entries of the .npz file; None removes one, a function maps the old one."""
 
     def apply(file: Path) -> None:
         with np.load(file) as content:
@@ -71,7 +71,7 @@ def pose(change: Callable[[np.ndarray], np.ndarray]) -> Spoil:
 
 
 def edit(change: Callable[[dict], object]) -> Spoil:
-    """Of the JSON file with most frames."""
+    """Changes the JSON file with the most frames."""
 
     def apply(scene: Path) -> None:
         file = next(scene / name for name in ("transforms.json", "transforms_train.json") if (scene / name).exists())
@@ -110,19 +110,19 @@ NPZ = [
     (entries(images_val=lambda x: x[:0], c2ws_val=lambda x: x[:0]), "0 views"),
     (entries(c2ws_train=lambda x: x[:2]), "9 images for 2 poses"),
     (pose(lambda p: p * np.nan), "c2ws_train[1]: found nan"),
-    (pose(lambda p: p * [2, 2, 3, 1]), "c2ws_train[1]: found no rotation"),
+    (pose(lambda p: p * [2, 2, 3, 1]), "c2ws_train[1]: found shear"),
     (pose(lambda p: p * [-1, 1, 1, 1]), "c2ws_train[1]: found a mirror"),
     (pose(lambda p: p.T), "c2ws_train[1]: found another bottom row"),
     (pose(lambda p: p + 1e30 * np.eye(4, k=3)), "c2ws_train[1]: found a camera farther"),
     (entries(focal=-3.0), "focal: found [[-3"),
-    (entries(K=[[60.0, 0, 1e9], [0, 60, 3], [0, 0, 1]]), "none of these numbers above"),
-    (entries(K=[[600.0, 0, 240], [0, 600, 200], [0, 0, 1]]), "the middle of photos 10 times as large"),
+    (entries(K=[[60.0, 0, 1e9], [0, 60, 3], [0, 0, 1]]), "no number above"),
+    (entries(K=[[600.0, 0, 240], [0, 600, 200], [0, 0, 1]]), "the middle of photos 10 times the size"),
     (entries(near=3.0, far=2.0), "far: found 2"),
     (entries(aabb=[[1.0, 1, 1], [0, 2, 2]]), "aabb: found"),
     (entries(to_source=EYE + np.eye(4, k=1) * [0, 1, 0, 0]), "a similarity"),
     (entries(background=[0, 2, 0.5]), "background: found"),
     (entries(focal=PICKLED), "Object arrays"),
-    (entries(c2ws_train=lambda x: x * np.array([*[[1, 1, 1, 1e-14]] * 3, [1] * 4])), "take another unit"),
+    (entries(c2ws_train=lambda x: x * np.array([*[[1, 1, 1, 1e-14]] * 3, [1] * 4])), "change the unit"),
     (lambda file: file.write_bytes(file.read_bytes()[:-200]), "BadZipFile"),
 ]
 JSON = [
@@ -135,12 +135,12 @@ JSON = [
     (no_photos, "(nor are 11 more)"),
     (frame(fl_x=None, fl_y=None), "no focal length"),
     (frame(fl_x=None, fl_y=None, camera_angle_x=62.0), "radians"),
-    (frame(k1=-50.0), "folds the photo over"),
+    (frame(k1=-50.0), "is not invertible"),
     (frame(k4=0.1), "k4: found 0.1"),
     (frame(rolling_shutter=[0, 0, 0.03, 0]), "rolling_shutter: found"),
     (frame(w=60, h=40), "found 48x40 pixels, expected 60x40"),
-    (edit(lambda c: c.update(val_filenames=["images/x.png"])), "which is no frame"),
-    (edit(lambda c: c.update(train_filenames=ALL, val_filenames=ALL[:1])), "which is in train_filenames too"),
+    (edit(lambda c: c.update(val_filenames=["images/x.png"])), "which is not a frame"),
+    (edit(lambda c: c.update(train_filenames=ALL, val_filenames=ALL[:1])), "which is also in train_filenames"),
 ]
 BLENDER = [
     (edit(lambda c: c.pop("camera_angle_x")), "no focal length"),

@@ -11,7 +11,7 @@ SIZES = [(40, 20), (16, 16), (7, 33)]
 
 
 def make_views(masked: bool = False) -> Views:
-    """Three sizes; each pixel's number is its colour."""
+    """Three sizes; each pixel's index is its colour."""
     sizes = torch.tensor(SIZES)
     count = int(sizes.prod(1).sum())
     numbers = torch.arange(count)
@@ -29,7 +29,7 @@ def make_generator(seed: int = 0) -> Generator:
 def make_trained_sampler(
     views: Views, errors: Tensor, share: float = 0.5, steps: int = 2 * UPDATE_EVERY
 ) -> ErrorSampler:
-    """After some steps in which each pixel had its own error."""
+    """Sampler after steps with a fixed error per pixel."""
     sampler = ErrorSampler(views, share)
     for step in range(steps):
         pixels, _ = sampler.draw(4000, make_generator(step))
@@ -81,7 +81,7 @@ def test_error_sampler_state_resumes_exactly():
         assert all(map(torch.equal, other.draw(300, make_generator(step)), (pixels, weights)))
         whole.update(errors[pixels])
         order = torch.randperm(300)  # sums do not depend on it
-        other.drawn = other.drawn[order]
+        other.last_tiles = other.last_tiles[order]
         other.update(errors[pixels][order])
     assert all(map(torch.equal, whole.state_dict().values(), other.state_dict().values()))
 

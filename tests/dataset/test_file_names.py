@@ -1,4 +1,4 @@
-"""Names in scene files, and the files on disk that they mean."""
+"""Resolving names in scene files to files on disk."""
 
 import unicodedata
 from pathlib import Path
@@ -37,7 +37,7 @@ FOUND = {
 }
 
 
-def test_find_images_name_means_the_one_file(tmp_path: Path):
+def test_find_images_resolves_names(tmp_path: Path):
     cafe = unicodedata.normalize("NFD", "images/café.png")
     others = ("images/._a.png", "images/.DS_Store", "masks/a.png", "images_4/a.png", "images/10.png")
     root = make_files(tmp_path, "images/a.png", "images/b  c.png", cafe, *others)
@@ -45,15 +45,15 @@ def test_find_images_name_means_the_one_file(tmp_path: Path):
         assert find(root, name) == [None if expected is None else root / expected], case
 
 
-def test_find_images_folders_decide(tmp_path: Path):
+def test_find_images_prefers_matching_folders(tmp_path: Path):
     root = make_files(tmp_path, "images/front/0.png", "images/back/0.png")
     assert find(root, "/data/Front/0.PNG") == [root / "images/front/0.png"]
     with pytest.raises(InputError, match=r"'0\.jpg' may mean 2 files: images/back/0\.png, images/front"):
         find(root, "0.jpg")
 
 
-def test_find_images_file_has_one_name(tmp_path: Path):
-    """Test poses whose photos are not there must not take the training photos of the same numbers."""
+def test_find_images_assigns_each_file_once(tmp_path: Path):
+    """Test poses without photos must not match training photos of the same number."""
     root = make_files(tmp_path, "train/1.png")
     file = root / "train/1.png"
     assert find(root, "test/1.png", "train/1.png") == [None, file]

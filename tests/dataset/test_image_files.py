@@ -17,7 +17,7 @@ from tests.helpers.exif_tags import encode_exif
 
 
 def photo(width: int, height: int) -> np.ndarray:
-    """Fine detail over a ramp, not the same when turned or flipped."""
+    """Fine detail over a ramp, without symmetry."""
     y, x = np.mgrid[:height, :width]
     noise = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 60, (height, width, 3)), (0, 0), 1.0)
     ramp = np.stack([x * 255 / width, y * 255 / height, (x + y) * 127 / (width + height)], axis=-1)
@@ -42,7 +42,7 @@ def test_read_pixels_reduced_jpeg_is_the_area_average(orientation: int, upright:
 
 
 def test_choose_draft_scale_leaves_enough_pixels():
-    """Two for each at least, where it is no exact fraction; and none that would end beside the pixel grid."""
+    """At least two pixels per output pixel unless exact, and no partial pixels at the edge."""
     for wanted, factor in (((1008, 756), 4), ((504, 378), 8), ((500, 375), 4), ((1000, 750), 2), ((4032, 3024), 1)):
         assert choose_draft_scale(4032, 3024, wanted) == factor
     assert choose_draft_scale(4030, 3024, (1008, 756)) == 1
@@ -67,7 +67,7 @@ def test_read_pixels_grey_and_cmyk_become_rgb(mode: str, tmp_path: Path):
 
 @pytest.mark.skipif(importlib.util.find_spec("pillow_heif") is None, reason="pillow-heif is not installed")
 def test_read_pixels_heic_is_upright(tmp_path: Path):
-    """A smooth picture with a tag that would turn it, of which a HEIC reader has no need."""
+    """A smooth picture with an orientation tag, which a HEIC reader must ignore."""
     import pillow_heif
 
     file, picture = tmp_path / "a.HEIC", np.linspace(0, 255, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)

@@ -23,7 +23,7 @@ def views(ball_views_of: Callable[..., Views]) -> Views:
 
 
 def mixed() -> Views:
-    """Three sizes; each pixel is its own colour."""
+    """Three sizes; each pixel has a unique colour."""
     sizes = torch.tensor([[4, 3], [2, 5], [7, 1]])
     K = torch.eye(3).repeat(3, 1, 1)
     K[:, :2, 2] = sizes / 2
@@ -43,7 +43,7 @@ def test_views_several_sizes_are_stored_without_padding():
     assert following.pixels.data_ptr() == views.image(1).data_ptr(), "no copy"
 
 
-def test_make_batch_several_sizes_match_their_colours():
+def test_make_batch_several_sizes_match_their_colors():
     views = mixed()
     batch = make_batch(views, views.sample_pixels(2000, torch.Generator().manual_seed(0)))
     directions = torch.cat([views.cameras.generate_view_rays(view).directions for view in range(3)])
@@ -53,7 +53,7 @@ def test_make_batch_several_sizes_match_their_colours():
     assert len(counts) == 29 and float(((counts - 2000 / 29) ** 2 * 29 / 2000).sum()) < 28 + 5 * 56**0.5, "chi squared"
 
 
-def test_ray_data_held_out_masked_view_knows_its_pixels():
+def test_ray_data_held_out_masked_view_has_valid_mask():
     views = mixed()
     known = torch.ones(29, dtype=torch.bool)
     known[3:9], known[11:13], known[22:] = False, False, False
@@ -99,7 +99,7 @@ def test_open_scene_mask_folder_is_read(ending: str, views: Views, tmp_path: Pat
 
 
 def write_subfolders(folder: Path, views: Views, masked: tuple[str, ...]) -> Path:
-    """Two cameras, whose photos have the same names in folders of their own; a mask leaves column 5 or 9 out."""
+    """Two cameras with equal photo names in separate folders; masks remove column 5 or 9."""
     columns = {"front": 5, "back": 9}
     names = []
     for camera, column in columns.items():
@@ -129,7 +129,7 @@ def test_open_scene_masks_in_subfolders_match_their_photos(views: Views, tmp_pat
     assert hidden == {"back": 0, "front": 40}, "the other camera's masks are not taken"
 
 
-def test_open_scene_masks_over_one_colour_cut_out(views: Views, tmp_path: Path):
+def test_open_scene_masks_over_uniform_color_cut_out(views: Views, tmp_path: Path):
     folder = capture(tmp_path, views, background=255)
     write_masks(folder / "images_mask", views)
     assert open_scene(str(folder)).train.channels == 4, "these photos are cut out already"
@@ -141,7 +141,7 @@ def test_open_scene_mask_options_are_followed(views: Views, tmp_path: Path, capl
     write_masks(folder / "masks", views, side=2)
     chosen = PhotoLoadOptions(), PhotoLoadOptions(invert_masks=True), PhotoLoadOptions(masked="background")
     straight, turned, empty = (open_scene(str(folder), options=options) for options in chosen)
-    assert "are they inverted? dataset.invert_masks=false takes them so" in caplog.text
+    assert "are they inverted? Set dataset.invert_masks=false if so" in caplog.text
     kept = views.image(1)[..., 3] > 127
     assert torch.equal(straight.train.view_mask(0), kept) and torch.equal(turned.train.view_mask(0), ~kept)
     assert empty.train.channels == 4 and empty.train.valid_mask is None and not empty.bounds.unbounded
@@ -154,11 +154,11 @@ def test_open_scene_fully_masked_view_is_not_held_out(views: Views, tmp_path: Pa
     imageio.imwrite(folder / "masks" / "0008.png", np.zeros((40, 48), np.uint8))
     with caplog.at_level(logging.WARNING):
         assert len(open_scene(str(folder)).val) == 2
-    assert "1 photos are masked entirely: left out" in caplog.text
+    assert "1 fully masked photos ignored" in caplog.text
 
 
 def test_open_scene_several_sizes_keep_their_rays(views: Views, tmp_path: Path):
-    """Photos are cropped to several sizes; the field's rays stay those of the whole photos."""
+    """Crops of several sizes have the rays of the full photos."""
     names = write_photos(tmp_path / "images", views)
     cameras = colmap_cameras(views)
     for i in range(0, len(names), 2):

@@ -21,7 +21,7 @@ def on_black(images: np.ndarray) -> np.ndarray:
 
 @pytest.fixture
 def arrays() -> Arrays:
-    """A valid file: two training views, one held out. The camera stands at (0, 0, 5) and looks along -z, y up."""
+    """A valid file: two training views, one held out. The camera at (0, 0, 5) looks along -z, y up."""
     rng = np.random.default_rng(0)
     c2w = np.diag([1.0, -1.0, -1.0, 1.0])
     c2w[2, 3] = 5.0
@@ -64,7 +64,7 @@ def test_load_npz_optional_keys_are_read(arrays: Arrays, path: Path):
 
 
 def test_load_npz_splits_follow_the_keys(arrays: Arrays, path: Path):
-    """Test photos count apart from val, or instead of it; without both, some training photos are held out."""
+    """Test photos are separate from val, or held out instead of it; without both, some training photos are held out."""
     test = {"images_test": arrays["images_train"], "c2ws_test": arrays["c2ws_train"]}
     np.savez(path, **arrays, **test)
     scene = load_npz(path)

@@ -1,4 +1,4 @@
-"""Photos that lie on their side, and whose EXIF data say so."""
+"""Photos with an EXIF rotation."""
 
 import logging
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from tests.helpers.scene_writers import colmap_cameras, write_colmap, write_llff
 
 
 def write_sideways(format: str, folder: Path, views: Views) -> Path:
-    """Upright cameras, and JPEGs stored turned left, with the orientation that turns them back."""
+    """Upright cameras, and JPEGs stored rotated left, with the EXIF orientation that rotates them back."""
     (folder / "images").mkdir(parents=True)
     names = [f"{i:04d}.jpg" for i in range(len(views))]
     for i, name in enumerate(names):
@@ -40,7 +40,7 @@ def test_open_scene_exif_orientation_that_fits_is_applied(
     folder = write_sideways(format, tmp_path / "s", views)
     with caplog.at_level(logging.WARNING):
         scene = open_scene(str(folder))
-    assert "9 photos are turned as their EXIF orientation says" in caplog.text
+    assert "9 photos are rotated by their EXIF orientation" in caplog.text
     assert scene.resolution == views.cameras.size(0)
     difference = (scene.train.image(0).float() - views.image(1)[..., :3]).abs().mean()
     assert float(difference) < 4, "JPEG's rounding"
@@ -56,6 +56,6 @@ def test_open_scene_square_photos_stay_as_stored(
     folder = write_sideways("transforms", tmp_path / "s", square)
     with caplog.at_level(logging.WARNING):
         stored = open_scene(str(folder))
-    assert "taken as they are stored (dataset.orientation=exif" in caplog.text
+    assert "pixels used as stored (dataset.orientation=exif" in caplog.text
     turned = open_scene(str(folder), options=PhotoLoadOptions(orientation="exif"))
     assert torch.equal(stored.train.image(0), torch.rot90(turned.train.image(0), 1))

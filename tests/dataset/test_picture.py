@@ -45,13 +45,13 @@ def test_load_picture_formats_return_rgb(red_then_blue: np.ndarray, tmp_path: Pa
 def test_load_picture_exif_orientation_is_applied(
     orientation: int, red_corner: tuple[int, int], red_then_blue: np.ndarray, tmp_path: Path
 ):
-    """8 turns the picture back a quarter: left becomes bottom."""
+    """8 rotates by 90 degrees: left becomes bottom."""
     path = tmp_path / "a.jpg"
     Image.fromarray(red_then_blue).save(path, quality=95, exif=encode_exif(orientation))
     picture = load_picture(path)
     assert picture.shape == ((64, 32, 3) if orientation == 8 else (32, 64, 3))
     assert (picture[red_corner].int() - torch.tensor(RED)).abs().max() < 8
-    # Posed photos are read as stored: their intrinsics speak of those pixels.
+    # Posed photos are read as stored: their intrinsics refer to those pixels.
     stored = read_pixels(path)
     assert stored.shape == (32, 64, 3) and stored[5, 5, 0] > 240
 
@@ -93,7 +93,7 @@ def test_load_picture_changed_png_raises(tmp_path: Path):
     path = tmp_path / "a.png"
     cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 255, (8, 8, 3), np.uint8))
     whole = path.read_bytes()
-    for at in range(8, len(whole) - 12):  # all but the end, which says nothing of the pixels
+    for at in range(8, len(whole) - 12):  # all but the IEND chunk
         path.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
         with pytest.raises(InputError, match="no readable image"):
             load_picture(path)

@@ -13,12 +13,12 @@ HEIGHT, WIDTH = 4, 7
 
 @pytest.fixture
 def picture() -> Picture:
-    """Every pixel's colour says which one it is: (row, column, 255)."""
+    """Each pixel's colour encodes its position: (row, column, 255)."""
     row, col = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
     return Picture("labels", "test", torch.stack([row, col, torch.full_like(row, 255)], dim=-1).to(torch.uint8))
 
 
-def test_pixel_data_coordinates_match_colours(picture: Picture):
+def test_pixel_data_coordinates_match_colors(picture: Picture):
     batch = PixelDataModule(picture, pixels=500).draw(0)
     assert batch.uv.shape == (500, 2) and batch.rgb.shape == (500, 3)
     row, col = (batch.rgb[:, :2] * 255).round().unbind(-1)
@@ -36,7 +36,7 @@ def test_pixel_data_held_out_is_the_whole_picture(picture: Picture):
     assert torch.equal(view.uv, pixel_grid(HEIGHT, WIDTH))
 
 
-def test_pixel_data_large_picture_draws_more():
+def test_pixel_data_large_picture_has_larger_batch():
     for side, expected in ((1024, 8192), (2048, 32768)):
         data = PixelDataModule(Picture("black", "test", torch.zeros(side, side, 3, dtype=torch.uint8)))
         assert data.pixels == len(data.draw(0).uv) == expected

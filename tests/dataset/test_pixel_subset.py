@@ -1,4 +1,4 @@
-"""Pixels of a view that stand for all of them."""
+"""Evenly spaced subsets of a view's pixels."""
 
 import pytest
 import torch

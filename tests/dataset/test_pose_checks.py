@@ -1,4 +1,4 @@
-"""Mistakes with the cameras of a file are recognised by matches between its photos, and named."""
+"""Matches between photos detect common mistakes with camera poses."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -40,7 +40,7 @@ def cameras_at(c2w: np.ndarray, focal: float = FOCAL, width: int = SIZE, height:
 
 
 def matches_of(c2w: np.ndarray, spread: float) -> Matches:
-    """Exact matches of neighbours: points around the origin, or all around from far."""
+    """Exact matches of neighbours: points around the origin, or surrounding the cameras."""
     points = torch.from_numpy(np.random.default_rng(0).normal(size=(4000, 3)) * spread).float()
     cameras = cameras_at(c2w)
     seen = [cameras.project(points, view) for view in range(len(c2w))]
@@ -56,7 +56,7 @@ def matches_of(c2w: np.ndarray, spread: float) -> Matches:
 def change_parts(
     rotation: Callable | None = None, centre: Callable | None = None
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """A change of the rotations, and one of the poses that gives other centres."""
+    """Changes the rotations, and replaces the centres by a function of the poses."""
 
     def apply(c2w: np.ndarray) -> np.ndarray:
         moved = c2w.copy()
@@ -75,35 +75,35 @@ MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
 SIDEWAYS, OTHER_UP = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 MISTAKES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "camera axes of the other convention": lambda c2w: c2w @ GL,
-    "world-to-camera matrices, where": np.linalg.inv,
+    "world-to-camera matrices instead": np.linalg.inv,
     "world-to-camera matrices": lambda c2w: np.linalg.inv(c2w @ GL),
     "transposed rotations": change_parts(lambda R: R.transpose(0, 2, 1)),
-    "translations of world-to-camera matrices": change_parts(centre=lambda c2w: np.linalg.inv(c2w)[:, :3, 3]),
-    "photos that lie on their sides or upside down": change_parts(lambda R: R @ SIDEWAYS),
+    "world-to-camera translations": change_parts(centre=lambda c2w: np.linalg.inv(c2w)[:, :3, 3]),
+    "photos that are rotated by 90 or 180 degrees": change_parts(lambda R: R @ SIDEWAYS),
     "a mirrored world": lambda c2w: MIRROR @ c2w @ MIRROR,
-    "rotations of quaternions in another order": change_parts(roll_quaternions),
-    "centres in another world frame than rotations": change_parts(centre=lambda c2w: c2w[:, :3, 3] @ OTHER_UP),
+    "quaternions in another order": change_parts(roll_quaternions),
+    "centres and rotations in different world frames": change_parts(centre=lambda c2w: c2w[:, :3, 3] @ OTHER_UP),
 }
 
 
 @pytest.mark.parametrize("words", MISTAKES)
 def test_list_conventions_each_mistake_is_named(words: str):
-    """What a file holds, in its own axes, is spoilt; matches are exact. Mirrors and turns look alike in either convention."""
+    """Corrupts poses in their file's axes, with exact matches. Mirrors and photo rotations look alike in either convention."""
     change = MISTAKES[words]
-    opengl = "mirrored" not in words and "sides" not in words
+    opengl = "mirrored" not in words and "90" not in words
     right = ring(24, outward=not opengl)
     matches = matches_of(right, 0.6 if opengl else 8.0)
     read = change(right @ GL) @ GL if opengl else change(right)
     assert compute_inlier_ratio(matches, right) == 1
     assert compute_inlier_ratio(matches, read) < 0.4
 
-    assert max(compute_inlier_ratio(matches, one.c2w) for one in list_conventions(right)) < 0.98
-    best = max(list_conventions(read), key=lambda one: compute_inlier_ratio(matches, one.c2w))
+    assert max(compute_inlier_ratio(matches, hypothesis.c2w) for hypothesis in list_conventions(right)) < 0.98
+    best = max(list_conventions(read), key=lambda hypothesis: compute_inlier_ratio(matches, hypothesis.c2w))
     assert compute_inlier_ratio(matches, best.c2w) == 1 and words in best.fault
 
 
 def scene_of(c2w: np.ndarray, names: tuple[str, ...] = (), focal: float = 80.0, width: int = 96) -> Scene:
-    """Photos of a room without bounds; every eighth is held out."""
+    """Photos of an unbounded room; every eighth is held out."""
     cameras = cameras_at(c2w, focal, width, 3 * width // 4)
     room = ROOMS["filling subject"]
     views = render_room(room, cameras)
@@ -115,7 +115,7 @@ def scene_of(c2w: np.ndarray, names: tuple[str, ...] = (), focal: float = 80.0, 
 
 
 def diverging(count: int = 20) -> np.ndarray:
-    """Cameras side by side that look ahead, outward the farther they stand from the middle."""
+    """Forward-facing cameras whose axes diverge from the middle."""
     i = torch.arange(count)
     eyes = torch.stack([torch.full((count,), -2.4), 0.2 * (i % 5 - 2), 0.2 * (i // 5 - 1.5)], dim=1).double()
     ahead = torch.tensor([1.0, 0.0, 0.0]) + torch.tensor([0.0, 0.4, 0.4]) * eyes
@@ -128,7 +128,7 @@ def forward() -> Scene:
 
 
 def test_check_cameras_diverging_axes_raise_no_issue(forward: Scene):
-    """They meet behind the cameras, as flipped ones do."""
+    """The axes converge behind the cameras, as flipped ones do."""
     assert compare_with_matches(forward) == ([], True)
 
 
@@ -137,12 +137,12 @@ def test_check_scene_one_wrong_pose_is_named(forward: Scene):
         c2w[3, :3, 1:3] *= -1
         return c2w
 
-    (doubt,) = check_scene(replace(forward, train=map_poses(forward.train, turn)))
-    assert doubt.text == "1 training photos whose poses do not fit the others: 4.png"
+    (issue,) = check_scene(replace(forward, train=map_poses(forward.train, turn)))
+    assert issue.text == "1 training photos whose poses do not fit the others: 4.png"
 
 
 def change_poses_of(scene: Scene, change: Callable[[np.ndarray], np.ndarray]) -> Scene:
-    """Poses of both splits, in the order of the names, changed."""
+    """Changes the poses of both splits, ordered by name."""
     order = np.argsort([int(name.removesuffix(".png")) for name in scene.train.names + scene.val.names])
     every = torch.cat([scene.train.cameras.c2w, scene.val.cameras.c2w]).double().numpy()
     every[order] = change(every[order])
@@ -152,23 +152,21 @@ def change_poses_of(scene: Scene, change: Callable[[np.ndarray], np.ndarray]) ->
 
 
 ORDERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "poses that are those of the photos before them": lambda c2w: np.roll(c2w, 1, axis=0),
-    "poses that are those of the photos after them": lambda c2w: np.roll(c2w, -1, axis=0),
+    "each photo has that of the previous hypothesis": lambda c2w: np.roll(c2w, 1, axis=0),
+    "each photo has that of the next hypothesis": lambda c2w: np.roll(c2w, -1, axis=0),
     "poses in the reverse order of the photos": lambda c2w: c2w[::-1].copy(),
-    "whose names sort otherwise as numbers": (
-        lambda c2w: c2w[np.argsort(sorted(range(len(c2w)), key=lambda i: f"{i}.png"))]
-    ),
+    "names sorted as numbers": (lambda c2w: c2w[np.argsort(sorted(range(len(c2w)), key=lambda i: f"{i}.png"))]),
 }
 
 
 @pytest.mark.parametrize("words", ORDERS)
 def test_list_orders_restores_the_order(words: str):
-    """Whatever the split."""
+    """Independent of the split."""
     right = ring(24)
     order = np.argsort(np.arange(24) % 8 == 0, kind="stable")  # held-out photos come last
     names = [f"{i}.png" for i in order]
     hypotheses = list_orders(names, ORDERS[words](right)[order], np.arange(24))
-    found = [one.fault for one in hypotheses if np.allclose(one.c2w, right[order])]
+    found = [hypothesis.fault for hypothesis in hypotheses if np.allclose(hypothesis.c2w, right[order])]
     assert len(found) == 1 and words in found[0]
 
 
@@ -185,26 +183,26 @@ def test_list_orders_restores_the_order(words: str):
     ],
     ids=["axes", "shuffled", "focal", "held out"],
 )
-def test_check_scene_wrong_cameras_raise_what_is_wrong(forward: Scene, spoil: Callable[[Scene], Scene], words: str):
+def test_check_scene_wrong_cameras_raise(forward: Scene, spoil: Callable[[Scene], Scene], words: str):
     with pytest.raises(InputError, match=words):
         check_scene(spoil(forward))
 
 
 def test_check_scene_shuffled_poses_with_refinement_warn(forward: Scene):
-    (doubt,) = check_scene(shuffle_poses(forward, 0), refines_poses=True)
-    assert doubt.is_refinable and doubt.has_wrong_poses
+    (issue,) = check_scene(shuffle_poses(forward, 0), refines_poses=True)
+    assert issue.is_refinable and issue.has_wrong_poses
     with pytest.raises(InputError, match="other convention"):
         check_scene(change_poses_of(forward, lambda c2w: c2w @ GL), refines_poses=True)
 
 
 def test_find_pairs_matches_show_the_same_point(forward: Scene):
-    """Points of one photo, at their true depth, appear in the other where the match says."""
+    """Points of hypothesis photo, at their true depth, project to their matches in the other."""
     off = []
     views, cameras = forward.train, forward.train.cameras
     for pair in find_pairs([detect_features(views, view) for view in range(len(views))], cameras)[:6]:
-        column, row = torch.from_numpy(pair.places[:, 0]).long().unbind(1)
+        column, row = torch.from_numpy(pair.keypoints[:, 0]).long().unbind(1)
         rays = cameras.generate_rays(torch.full_like(column, pair.first), row, column)
         points = rays.origins + rays.directions * trace_rays(ROOMS["filling subject"].primitives, rays)[1][:, None]
         places = cameras.project(points, pair.second)[0].numpy()
-        off.append(np.linalg.norm(places - pair.places[:, 1], axis=1))
+        off.append(np.linalg.norm(places - pair.keypoints[:, 1], axis=1))
     assert np.median(np.concatenate(off)) < 1.5

@@ -14,7 +14,7 @@ VIEWS, HEIGHT, WIDTH = 3, 4, 6
 
 
 def make_labelled_views(count: int) -> Views:
-    """Every pixel's colour says which one it is: (view, row, column, 255)."""
+    """Each pixel's colour encodes its position: (view, row, column, 255)."""
     view, row, col = torch.meshgrid(*(torch.arange(n) for n in (count, HEIGHT, WIDTH)), indexing="ij")
     images = torch.stack([view, row, col, torch.full_like(view, 255)], dim=-1).to(torch.uint8)
     c2w = make_circle_poses(torch.zeros(3), torch.tensor([0.0, 0, 1]), 4.0, 0.3, count)
@@ -29,7 +29,7 @@ def scene() -> Scene:
     return Scene("labels", "test", train, val, val.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
 
 
-def test_make_batch_colours_belong_to_their_rays(scene: Scene):
+def test_make_batch_colors_match_rays(scene: Scene):
     batch = make_batch(scene.train, scene.train.sample_pixels(50, torch.Generator().manual_seed(0)))
     assert len(batch.rays) == len(batch.pixels) == 50
     for i, (view, row, col, _) in enumerate(batch.pixels.tolist()):
@@ -41,7 +41,7 @@ def test_make_batch_colours_belong_to_their_rays(scene: Scene):
 
 
 def test_measure_texturelessness_step_and_slope_differ():
-    """One photo with a step of colour and one with a slope, of two sizes: what counts is near by, and within the photo."""
+    """A photo with a colour step and one with a ramp, of two sizes: only nearby pixels of the same photo count."""
     step, slope = torch.full((20, 160, 3), 90), torch.arange(80).expand(40, 80)[..., None].repeat(1, 1, 3)
     step[:, 100:, 1] = 120
     images = [x.to(torch.uint8) for x in (step, slope)]
@@ -59,7 +59,7 @@ def test_measure_texturelessness_step_and_slope_differ():
     torch.testing.assert_close(second, torch.full_like(second, float(torch.tensor(-1 / 2.55).exp())))
 
 
-def test_ray_data_batch_depends_on_seed_and_step_alone(scene: Scene):
+def test_ray_data_batch_depends_only_on_seed_and_step(scene: Scene):
     def pixels(seed: int, step: int) -> list:
         return RayDataModule(scene, rays=50, seed=seed).draw(step).pixels.tolist()
 
@@ -67,7 +67,7 @@ def test_ray_data_batch_depends_on_seed_and_step_alone(scene: Scene):
     assert len({str(pixels(seed, step)) for seed in (0, 1) for step in range(20)}) == 40
 
 
-def test_ray_data_held_out_views_come_whole_and_in_order(scene: Scene):
+def test_ray_data_yields_whole_held_out_views_in_order(scene: Scene):
     data = RayDataModule(scene)
     batches = list(data.test_dataloader())
     assert len(batches) == len(data.test_dataloader()) == data.num_held_out_views == 2

@@ -1,4 +1,4 @@
-"""The region of detail of captures whose subject and depth are known."""
+"""Region of interest of captures with known subject and depth."""
 
 import logging
 import math
@@ -28,18 +28,18 @@ def sample_box(low: tuple[float, ...], high: tuple[float, ...], count: int = 400
 
 
 def sample_sphere(radius: float) -> Float[Tensor, "P 3"]:
-    """Points all around `CENTRE`."""
+    """Points on a sphere around `CENTRE`."""
     points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     return CENTRE + radius * points / points.norm(dim=1, keepdim=True)
 
 
 def size_of(scene: Scene) -> float:
-    """The scene's unit, in that of its file."""
+    """Unit of the scene, in its file's unit."""
     return float(torch.linalg.det(scene.to_source[:3, :3].double()) ** (1 / 3))
 
 
 def make_views(c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Views:
-    """Photos of what is drawn, or of noise."""
+    """Photos rendered by `draw`, or of noise."""
     K = torch.tensor([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]).repeat(len(c2w), 1, 1)
     cameras = Cameras.pinhole(K, c2w.float(), WIDTH, HEIGHT)
     noise = torch.randint(0, 255, (len(c2w), HEIGHT, WIDTH, 3), generator=torch.manual_seed(0)).to(torch.uint8)
@@ -47,7 +47,7 @@ def make_views(c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | 
 
 
 def write_folder(folder: Path, c2w: Float[Tensor, "V 4 4"], draw: Callable[[Cameras], Tensor] | None = None) -> Path:
-    """A capture of what is drawn, or of noise, as transforms.json."""
+    """transforms.json with photos rendered by `draw`, or of noise."""
     views = make_views(c2w, draw)
     write_transforms(folder / "transforms.json", views, write_photos(folder, views), w=WIDTH, h=HEIGHT)
     return folder
@@ -70,7 +70,7 @@ def test_find_region_ring_is_centred_on_its_subject(yaw: int, distance: float):
 
 
 def test_find_region_arc_is_centred_by_points():
-    """A subject, and a wall behind it that few of the photos show."""
+    """A subject, and a wall behind it in few of the photos."""
     points = torch.cat([sample_box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), sample_box((-6, -6, -1), (-5, 6, 4))])
     region = find_region(ring_poses(24, 15, degrees=150), points)
     assert float((region.centre - CENTRE).norm()) < 0.1 * RADIUS
@@ -102,7 +102,7 @@ def test_find_region_walk_holds_its_cameras():
 
 
 def render_inside_ball(cameras: Cameras, radius: float = 3.0) -> UInt8[Tensor, "V H W 3"]:
-    """Photos from within a ball around the origin that is painted with coarse noise."""
+    """Photos from inside a ball around the origin with a coarse noise texture."""
     paint = cv2.GaussianBlur(np.random.default_rng(0).integers(0, 255, (512, 1024, 3)).astype(np.float32), (0, 0), 3)
     paint = (128 + 12 * (paint - paint.mean())).clip(0, 255).astype(np.uint8)
     images = []
@@ -135,7 +135,7 @@ def test_open_scene_without_depth_matches_photos(c2w: torch.Tensor, layout: Came
 def test_open_scene_pan_unknown_depth_warns(noise: float, tmp_path: Path, caplog: pytest.LogCaptureFixture):
     with caplog.at_level(logging.WARNING):
         scene = open_scene(str(write_folder(tmp_path, pan(noise))))
-    assert ("how far away" in caplog.text) == (noise > 0)
+    assert ("determine the depth" in caplog.text) == (noise > 0)
     assert scene.bounds.unbounded and scene.bounds.near is None
     assert float((scene.to_source[:3, 3].double() - CENTRE).norm()) < 0.05
 

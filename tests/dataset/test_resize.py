@@ -1,4 +1,4 @@
-"""The size at which photos are read where nobody says, and reduced copies that others made."""
+"""Automatic photo size, and reduced copies in image folders."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -70,7 +70,7 @@ def test_open_scene_reduced_copies_that_fit_are_used(views: Views, tmp_path: Pat
 
 
 def test_load_views_reduced_jpeg_is_averaged(tmp_path: Path):
-    """As of a PNG, which is decoded whole."""
+    """Compared with a PNG, which is decoded at full size."""
     y, x = np.mgrid[:96, :160]
     pixels = np.stack([x, 2 * y, 255 - x], axis=-1).astype(np.uint8)
     mask = np.where((x - 70) ** 2 + (y - 50) ** 2 < 900, 255, 0).astype(np.uint8)
@@ -89,8 +89,8 @@ def test_load_views_reduced_jpeg_is_averaged(tmp_path: Path):
     assert (a.pixels.int() - b.pixels.int()).abs().max() <= 8
 
 
-def test_data_again_keeps_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Whatever its budget, the threads and the memory are by then."""
+def test_reload_data_keeps_the_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Independent of budget, threads and memory at that time."""
     save_npz(bricks(size=48, train_views=4, val_views=2), tmp_path / "scene.npz")
     monkeypatch.setattr(resize_module, "MIN_LONGEST_PX", 16)
     monkeypatch.setattr(resize_module, "REFERENCE_LONGEST_PX", 400)

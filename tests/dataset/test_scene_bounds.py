@@ -41,8 +41,8 @@ def test_estimate_bounds_broken_silhouettes_are_forgiven_or_ignored(
     views = ball_views_of(10)
     views.images[7] = 0
     assert_tight(estimate_bounds(views, BLACK).aabb, ball_box, 1.23)
-    views.images[::3] = 0  # the ball is missing from a third of the views: no voxel convinces enough of them
-    # What cameras see: 4 away from the origin, half of 48 pixels wide at a focal length of 60.
+    views.images[::3] = 0  # the ball is missing from a third of the views: too few agree on any voxel
+    # The visible cube: 4 away from the origin, half of 48 pixels wide at a focal length of 60.
     seen = torch.tensor([[-1.6] * 3, [1.6] * 3])
     torch.testing.assert_close(estimate_bounds(views, BLACK).aabb, seen, atol=1e-4, rtol=0)
     noise = torch.randint(0, 256, (*views.images.shape[:3], 3), generator=torch.manual_seed(0)).to(torch.uint8)

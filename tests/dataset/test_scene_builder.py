@@ -1,4 +1,4 @@
-"""Posed photos in one frame, whatever frame they came in."""
+"""World frame of scenes built from posed photos in any frame."""
 
 from pathlib import Path
 
@@ -39,7 +39,7 @@ def test_make_region_frame_any_frame_is_turned_upright(some: slice):
 
 
 def test_open_scene_walk_has_no_near(tmp_path: Path):
-    """Only where all cameras look at one thing is it known that nothing is near."""
+    """Only a common subject implies that nothing is near."""
     walk = torch.eye(4).repeat(9, 1, 1)
     walk[:, 0, 3] = torch.linspace(-4, 4, 9)
     for name, c2w, near in (("walk", walk, None), ("ring", RING, 0.25)):

@@ -1,4 +1,4 @@
-"""What is bounded is decided by the photos, the same for every file format."""
+"""Classification into bounded and unbounded scenes, equal for every file format."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,7 +21,7 @@ def ball_views(ball_views_of: Callable[..., Views]) -> Views:
 
 
 def with_background(views: Views, alpha: int | None) -> Views:
-    """On noise, without alpha or with one that is the same everywhere."""
+    """Photos on noise, without alpha or with a constant one."""
     noise = torch.randint(0, 255, (len(views.pixels), 3), generator=torch.Generator().manual_seed(0))
     rgb = torch.where(views.pixels[:, 3:] > 0, views.pixels[:, :3], noise).to(torch.uint8)
     if alpha is None:
@@ -29,13 +29,13 @@ def with_background(views: Views, alpha: int | None) -> Views:
     return replace(views, pixels=torch.cat([rgb, torch.full_like(rgb[:, :1], alpha)], dim=1))
 
 
-def on_colour(views: Views, colour: int) -> Views:
+def on_color(views: Views, color: int) -> Views:
     alpha = views.pixels[:, 3:].float() / 255
-    return replace(views, pixels=(views.pixels[:, :3] * alpha + colour * (1 - alpha)).round().to(torch.uint8))
+    return replace(views, pixels=(views.pixels[:, :3] * alpha + color * (1 - alpha)).round().to(torch.uint8))
 
 
 def with_margin(views: Views) -> Views:
-    """A background, and transparent margins as undistorting leaves them."""
+    """Photos with a background and transparent margins, as left by undistortion."""
     views = with_background(views, 255)
     for view in range(len(views)):
         views.image(view)[[0, -1], :, 3] = 0
@@ -45,7 +45,7 @@ def with_margin(views: Views) -> Views:
 
 SHOWN: dict[str, tuple[Callable[[Views], Views], bool, int, str]] = {
     "cut out": (lambda views: views, True, 4, "alpha cuts the subject out"),
-    "on grey": (lambda views: on_colour(views, 90), True, 3, "borders have one colour"),
+    "on grey": (lambda views: on_color(views, 90), True, 3, "borders have one color"),
     "background": (lambda views: with_background(views, None), False, 3, "show a background"),
     "opaque alpha": (lambda views: with_background(views, 255), False, 3, "show a background"),
     "margins": (with_margin, False, 3, "show a background"),

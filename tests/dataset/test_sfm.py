@@ -23,12 +23,12 @@ from tests.helpers.exif_tags import encode_exif
 SMALLER = ("3.jpg", "4.jpg")
 """Taken by a second camera."""
 TURNED = ("5.jpg", "6.jpg")
-"""Stored lying, with a tag that says so."""
+"""Stored sideways, with an EXIF orientation."""
 
 
 @pytest.fixture(scope="module")
 def photos(tag_capture: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A third of the way around an object: two cameras, and two photos with an EXIF rotation; read only."""
+    """A third of an orbit: two cameras, and two photos with an EXIF rotation; read only."""
     folder = tmp_path_factory.mktemp("photos")
     for number, path in enumerate(sorted((tag_capture[0] / "photos").iterdir())):
         pixels = read_pixels(path)
@@ -36,40 +36,42 @@ def photos(tag_capture: tuple[Path, Truth], tmp_path_factory: pytest.TempPathFac
         if name in SMALLER:
             pixels = cv2.resize(pixels, (380, 285), interpolation=cv2.INTER_AREA)
         stored = np.rot90(pixels) if name in TURNED else pixels
-        # 350 pixels of 400x300 are 30 mm of a film; the smaller photos do not tell.
+        # 350 pixels of 400x300 are 30 mm on film; the smaller photos have no focal length.
         exif = encode_exif(6 if name in TURNED else 1, focal_35mm=0 if name in SMALLER else 30)
         Image.fromarray(np.ascontiguousarray(stored)).save(folder / name, quality=97, exif=exif)
     return folder
 
 
 @pytest.fixture(scope="module")
-def placed(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[pycolmap.Reconstruction, Path]:
-    """What COLMAP makes of copies that are smaller than the photos, and where it worked."""
+def reconstruction(photos: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[pycolmap.Reconstruction, Path]:
+    """COLMAP's model from copies smaller than the photos, and its workspace."""
     workspace = tmp_path_factory.mktemp("workspace")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(colmap, "COPY_SIDE", 390)
+        patched.setattr(colmap, "COPY_SIDE_PX", 390)
         model = colmap.reconstruct(find_photos(photos, ""), workspace)
     assert model is not None
     return model, workspace
 
 
 @pytest.fixture
-def own(photos: Path, placed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[int]]:
-    """A copy of the photos that COLMAP places at once; and how many it placed in each call."""
+def sfm_folder(photos: Path, reconstruction, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[int]]:
+    """A copy of the photos with a cached reconstruction; and the number of photos in each call."""
     folder, calls = tmp_path / "photos", []
     shutil.copytree(photos, folder)
     monkeypatch.setenv("NERF_LIGHTNING_CACHE", str(tmp_path / "cache"))
 
     def reconstruct(photos: list[Path], workspace: Path) -> pycolmap.Reconstruction:
         calls.append(len(photos))
-        return placed[0]
+        return reconstruction[0]
 
     monkeypatch.setattr(module, "reconstruct", reconstruct)
     return folder, calls
 
 
-def test_reconstruct_two_cameras_gives_full_size_upright_model(placed, tag_capture: tuple[Path, Truth], tmp_path: Path):
-    placed[0].write_binary(tmp_path)
+def test_reconstruct_two_cameras_gives_full_size_upright_model(
+    reconstruction, tag_capture: tuple[Path, Truth], tmp_path: Path
+):
+    reconstruction[0].write_binary(tmp_path)
     model = pycolmap.Reconstruction(tmp_path)
     images = {image.name: image for image in model.images.values() if image.has_pose}
     assert len(images) >= 7 and set(images) <= {f"{number}.jpg" for number in range(8)}
@@ -93,8 +95,8 @@ def test_reconstruct_two_cameras_gives_full_size_upright_model(placed, tag_captu
     assert np.median(off / np.linalg.norm(truth[:, :3, 3], axis=-1)) < 0.05
 
 
-def test_reconstruct_exif_focal_is_the_prior(placed):
-    with pycolmap.Database.open(placed[1] / "database.db") as content:
+def test_reconstruct_exif_focal_is_the_prior(reconstruction):
+    with pycolmap.Database.open(reconstruction[1] / "database.db") as content:
         cameras = {camera.width: camera for camera in content.read_all_cameras()}
         counts = [image.camera_id for image in content.read_all_images()]
     assert sorted(cameras) == [380, 390] and sorted(map(counts.count, set(counts))) == [2, 6]
@@ -123,27 +125,27 @@ def test_read_lens_tags_let_colmap_infer_focal(exif: dict, pixels: float | None,
     assert pixels is None or camera.mean_focal_length() == pytest.approx(pixels, rel=1e-3)
 
 
-def test_run_sfm_twice_reconstructs_once(own, caplog: pytest.LogCaptureFixture):
-    folder, calls = own
+def test_run_sfm_twice_reconstructs_once(sfm_folder, caplog: pytest.LogCaptureFixture):
+    folder, calls = sfm_folder
     caplog.set_level(logging.INFO)
     assert run_sfm(folder) == run_sfm(folder) and calls == [8]
-    assert "kept from an earlier run" in caplog.text and "of 8 photos placed" in caplog.text
+    assert "reused from an earlier run" in caplog.text and "of 8 photos registered" in caplog.text
     assert pycolmap.Reconstruction(run_sfm(folder)).num_reg_images() >= 7
     shutil.copy(folder / "7.jpg", folder / "8.jpg")
     run_sfm(folder)
-    assert "made of other files" in caplog.text and "not placed" in caplog.text and "8.jpg" in caplog.text
+    assert "the source files changed" in caplog.text and "not registered" in caplog.text and "8.jpg" in caplog.text
     (folder / "8.jpg").touch()
     run_sfm(folder)
     assert calls == [8, 9, 9]
 
 
-def test_run_sfm_disconnected_photos_raise(own, monkeypatch: pytest.MonkeyPatch):
+def test_run_sfm_disconnected_photos_raise(sfm_folder, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "reconstruct", lambda photos, workspace: None)
-    with pytest.raises(InputError, match="0 of 8 photos that hang together, expected at least 3; take more photos"):
-        run_sfm(own[0])
+    with pytest.raises(InputError, match="0 of 8 photos that COLMAP could register, expected at least 3; take more"):
+        run_sfm(sfm_folder[0])
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     with pytest.raises(InputError, match=r"pip install 'nerf_lightning\[colmap\]'"):
-        run_sfm(own[0])
+        run_sfm(sfm_folder[0])
 
 
 def test_pair_photos_many_gives_window_and_loop_pairs():

@@ -19,19 +19,19 @@ POINT = np.array([0.9, -0.4, 0.7])
 
 
 def opengl_pose(angle: float) -> np.ndarray:
-    """A camera 5 away from the world's y axis, looking at the origin; y is up. OpenGL: it looks along its own -z."""
+    """A camera 5 units from the world's y axis, looking at the origin, y up; OpenGL axes (viewing along -z)."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, 0, s, 5 * s], [0, 1, 0, 0.3], [-s, 0, c, 5 * c], [0, 0, 0, 1]])
 
 
 def project_point(pose: np.ndarray, intrinsics: dict, point: np.ndarray) -> np.ndarray:
-    """Where a lens sees a world point, in OpenCV's indices (a pixel's centre is an integer)."""
+    """Projects a world point, in OpenCV's indices (pixel centres are integers)."""
     local = pose[:3, :3].T @ (point - pose[:3, 3])
     K = np.array(
         [[intrinsics["fl_x"], 0, intrinsics["cx"] - 0.5], [0, intrinsics["fl_y"], intrinsics["cy"] - 0.5], [0, 0, 1]]
     )
     distortion = np.array([intrinsics.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")])
-    # y and z turn over from OpenGL's camera axes to OpenCV's.
+    # y and z flip from OpenGL's camera axes to OpenCV's.
     pixel, _ = cv2.projectPoints((local * [1, -1, -1]).reshape(1, 1, 3), np.zeros(3), np.zeros(3), K, distortion)
     return pixel.reshape(2)
 
@@ -61,7 +61,7 @@ def capture(tmp_path: Path) -> Path:
 
 
 def dot_error(scene: Scene) -> float:
-    """How far the rays through the dots miss POINT, in pixels, at worst."""
+    """Largest distance in pixels of POINT from the rays through its dots."""
     point = transform_points(torch.linalg.inv(scene.to_source), torch.from_numpy(POINT).float())
     worst = 0.0
     for views in (scene.train, scene.val):
@@ -112,21 +112,21 @@ def test_load_transforms_mask_path_is_read(capture: Path, caplog: pytest.LogCapt
     change(capture, lambda c: c["frames"][1].update(mask_path="mask.png", depth_file_path="depth.png"))
     with caplog.at_level(logging.INFO):
         scene = load_transforms(capture, options=PhotoLoadOptions(masked="ignore"))
-    assert "keys that are not used: depth_file_path" in caplog.text
+    assert "ignoring unknown keys: depth_file_path" in caplog.text
     assert torch.equal(scene.train.view_mask(0), torch.from_numpy(mask > 0)) and scene.train.view_mask(1).all()
 
 
-def test_load_transforms_missing_photos_are_left_out_with_a_warning(capture: Path, caplog: pytest.LogCaptureFixture):
+def test_load_transforms_missing_photos_are_ignored_with_a_warning(capture: Path, caplog: pytest.LogCaptureFixture):
     for i in (3, 4, 7):
         (capture / f"images/{i:04d}.png").unlink()
     with caplog.at_level(logging.WARNING):
         scene = load_transforms(capture)
-    assert (len(scene.train), len(scene.val)) == (7, 2) and "3 of 12 photos are not there" in caplog.text
+    assert (len(scene.train), len(scene.val)) == (7, 2) and "ignoring 3 of 12 photos without a file" in caplog.text
     assert dot_error(scene) < 0.02, "poses stay with their photos"
 
 
 def test_load_transforms_applied_transform_and_scale_are_undone(capture: Path, caplog: pytest.LogCaptureFixture):
-    """`applied_scale`, after `applied_transform`: exports have the capture's unit. Rotations with a scale lose it."""
+    """`applied_scale`, after `applied_transform`: exports have the capture's unit. Scales of rotations are divided out."""
     before = load_transforms(capture)
     turn = np.array([[0.0, 1, 0, 0.5], [1, 0, 0, 0], [0, 0, -1, 2]])
     whole = np.concatenate([turn, [[0, 0, 0, 1]]])
@@ -142,7 +142,7 @@ def test_load_transforms_applied_transform_and_scale_are_undone(capture: Path, c
     change(capture, apply)
     with caplog.at_level(logging.WARNING):
         after = load_transforms(capture)
-    assert "12 of 12 rotations carry a uniform scale, such as 0.33: divided out" in caplog.text
+    assert "12 of 12 rotations have a uniform scale, such as 0.33: divided out" in caplog.text
     torch.testing.assert_close(after.to_source, before.to_source, atol=1e-5, rtol=0)
     torch.testing.assert_close(after.train.cameras.c2w, before.train.cameras.c2w, atol=1e-5, rtol=0)
 

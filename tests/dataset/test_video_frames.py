@@ -14,11 +14,11 @@ from nerf_lightning.errors import InputError
 
 PAUSE = 24
 SHIFTS = np.concatenate([4 * np.arange(31), np.full(PAUSE, 120), 120 + 4 * np.arange(1, 36)])
-"""Of the camera in pixels, by frame: it stands still in between."""
+"""Camera position in pixels by frame, with a pause."""
 
 
 def texture(height: int, width: int) -> np.ndarray:
-    """Detail of all sizes."""
+    """Texture with detail at all scales."""
     rng, out = np.random.default_rng(0), np.zeros((height, width, 3))
     for sigma in (0.7, 2.0, 6.0):
         layer = cv2.GaussianBlur(rng.standard_normal((height, width, 3)), (0, 0), sigma)
@@ -27,7 +27,7 @@ def texture(height: int, width: int) -> np.ndarray:
 
 
 def pan(shifts: np.ndarray) -> Iterator[np.ndarray]:
-    """A camera that moves along a wall. Each third picture, the second first, is brighter than the others."""
+    """Frames of a camera moving along a wall; every third one, from the second, is brighter."""
     wall, rng = texture(120, 160 + int(max(shifts))), np.random.default_rng(1)
     for index, shift in enumerate(shifts):
         picture = wall[:, shift : shift + 160] * (1.0 if index % 3 == 1 else 0.75)
@@ -36,7 +36,7 @@ def pan(shifts: np.ndarray) -> Iterator[np.ndarray]:
 
 @pytest.fixture(scope="module")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every third picture is blurred, weakly or strongly, and brighter; read only."""
+    """Every third frame is blurred, weakly or strongly, and brighter; read only."""
     file = tmp_path_factory.mktemp("video") / "wall.mp4"
     write_video(file, blur_images(pan(SHIFTS), seed=0))
     return file
@@ -83,14 +83,14 @@ def test_extract_frames_twice_decodes_once(tmp_path: Path, caplog: pytest.LogCap
     folder = extract_frames(video)
     assert len(list(folder.glob("*.jpg"))) == 4
     next(folder.glob("*.jpg")).unlink()
-    assert len(list(extract_frames(video).glob("*.jpg"))) == 3, "whoever deletes a frame does not get it back"
+    assert len(list(extract_frames(video).glob("*.jpg"))) == 3, "deleted frames are not restored"
     write_video(video, pan(SHIFTS[:15]))
     with caplog.at_level(logging.INFO):
         assert len(list(extract_frames(video).glob("*.jpg"))) == 5
-    assert "made of other files" in caplog.text
+    assert "the source files changed" in caplog.text
 
 
-def cut(file: Path) -> None:
+def truncate(file: Path) -> None:
     write_video(file, pan(SHIFTS[:9]))
     file.write_bytes(file.read_bytes()[:4000])
 

@@ -1,4 +1,4 @@
-"""What frames show, channel by channel, against what the renderer says."""
+"""Channels of frames against the renderer's output."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ RED = torch.tensor([1.0, 0.0, 0.0])
 
 
 def render_output(background: torch.Tensor) -> RenderOutput:
-    """Three rays: nothing there, half a red thing at 2, all of it at 4."""
+    """Three rays: empty, half opaque red at distance 2, opaque red at 4."""
     opacity = torch.tensor([0.0, 0.5, 1.0])
     rgb = opacity[:, None] * RED + (1 - opacity)[:, None] * background
     return RenderOutput(rgb, opacity, opacity * torch.tensor([0.0, 2.0, 4.0]))

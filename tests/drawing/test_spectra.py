@@ -10,7 +10,7 @@ BAND = 0.5 / NUM_BANDS
 
 
 def wave(across: float, down: float, height: int = SIDE, width: int = SIDE) -> np.ndarray:
-    """A cosine of so many cycles a pixel along each side."""
+    """A cosine wave, frequencies in cycles per pixel."""
     y, x = np.mgrid[:height, :width]
     return np.cos(2 * np.pi * (across * x + down * y))
 

@@ -98,7 +98,7 @@ def dispatch(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
 
 
 def empty_tensor(size: Any, *rest: Any, dtype: Any = None, **options: Any) -> FakeTensor:
-    return FakeTensor(torch.empty_tensor(size, dtype=dtype))
+    return FakeTensor(torch.empty(size, dtype=dtype))
 
 
 def empty_strided(size: Any, stride: Any, dtype: Any = None, **options: Any) -> FakeTensor:

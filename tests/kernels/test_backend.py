@@ -1,4 +1,4 @@
-"""Which version of a kernel runs."""
+"""Kernel selection."""
 
 import pytest
 import torch

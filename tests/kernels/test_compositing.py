@@ -1,4 +1,4 @@
-"""What rays hold: weights, pixels, and samples that are dropped or merged."""
+"""Rendering weights, compositing, and dropping and merging of samples."""
 
 import math
 
@@ -13,7 +13,7 @@ from tests.helpers.ragged_samples import BUNDLE, SAMPLE_COUNTS, make_ragged_samp
 
 @pytest.fixture(params=["formula", "auto", "reference"])
 def weights_of(request: pytest.FixtureRequest):
-    """How much each sample weighs: by the formula, and as the gradient of a ray's colour with respect to the sample's."""
+    """Rendering weights: by the formula, and as the gradient of a ray's colour in the sample's colour."""
     if request.param == "formula":
         return lambda density, samples: volume_weights(density, samples.dt, samples.ray, samples.offsets)
     set_kernels(request.param)
@@ -101,7 +101,7 @@ def packed(samples: Samples):
 
 
 def foggy(counts: list[int]) -> tuple[torch.Tensor, Samples]:
-    """Thickness and samples, of which some stand alone."""
+    """Optical depths and samples with gaps between some."""
     samples = make_ragged_samples(counts)
     keep = torch.rand(len(samples)) < 0.8
     ends = torch.cat([torch.zeros(1, dtype=torch.int64), keep.cumsum(0)])[samples.offsets]
@@ -110,7 +110,7 @@ def foggy(counts: list[int]) -> tuple[torch.Tensor, Samples]:
 
 
 def merge_brute_force(optical_depth: torch.Tensor, samples: Samples, min_weight: float) -> list[tuple[float, ...]]:
-    """Thickness, t, dt and ray of what remains."""
+    """Optical depth, t, dt and ray of the remaining samples."""
     found: list[tuple[float, ...]] = []
     for ray in range(len(samples.offsets) - 1):
         passed, last, weight_before = 0.0, None, 0.0

@@ -5,7 +5,7 @@ import torch
 from nerf_lightning.kernels import spherical_harmonics
 
 PRECISIONS = pytest.mark.parametrize(("dtype", "atol"), [(torch.float64, 1e-12), (torch.float32, 3e-6)])
-"""The reference alone speaks double precision."""
+"""Only the reference supports float64."""
 
 
 def sphere() -> tuple[torch.Tensor, np.ndarray]:

@@ -21,12 +21,12 @@ Levels = list[tuple[int, ...]]
 
 
 def entry(corner: list[int], cells: tuple[int, ...], size: int) -> int:
-    """Instant-NGP, eq. 4, in whole numbers without bounds; row by row where all corners fit."""
+    """Entry index by Instant-NGP, eq. 4, in unbounded integers; row-major where dense."""
     if math.prod(side + 1 for side in cells) <= size:
-        return sum(place * math.prod(side + 1 for side in cells[:axis]) for axis, place in enumerate(corner))
+        return sum(coordinate * math.prod(side + 1 for side in cells[:axis]) for axis, coordinate in enumerate(corner))
     hashed = 0
-    for place, prime in zip(corner, (1, 2654435761, 805459861), strict=False):
-        hashed ^= place * prime
+    for coordinate, prime in zip(corner, (1, 2654435761, 805459861), strict=False):
+        hashed ^= coordinate * prime
     return hashed % 2**32 % size
 
 
@@ -37,10 +37,10 @@ def brute_force(tables: Tensor, unit: Tensor, resolutions: Levels, sizes: list[i
         row, start = [], 0
         for cells, size in zip(resolutions, sizes, strict=True):
             low = [min(int(p * side), side - 1) for p, side in zip(point, cells, strict=True)]
-            share = [p * side - c for p, side, c in zip(point, cells, low, strict=True)]
+            fraction = [p * side - c for p, side, c in zip(point, cells, low, strict=True)]
             total = torch.zeros(tables.shape[1], dtype=torch.float64)
             for bits in itertools.product((0, 1), repeat=len(cells)):
-                weight = math.prod(f if bit else 1 - f for bit, f in zip(bits, share, strict=True))
+                weight = math.prod(f if bit else 1 - f for bit, f in zip(bits, fraction, strict=True))
                 corner = [c + bit for c, bit in zip(low, bits, strict=True)]
                 total += weight * tables[start + entry(corner, cells, size)]
             row.append(total)

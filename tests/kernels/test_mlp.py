@@ -9,7 +9,7 @@ from tests.helpers.kernel_comparison import run_with_threads, values_and_gradien
 
 
 def network(widths: tuple[int, ...], further: int = 0) -> list[Tensor]:
-    """Random matrix and bias of each layer, one after the other; the first also reads `further` inputs."""
+    """Random matrices and biases of all layers, flat; the first layer has `further` extra inputs."""
     flat: list[Tensor] = []
     for index, (i, o) in enumerate(pairwise(widths)):
         i += further if index == 0 else 0
@@ -46,6 +46,6 @@ def test_mlp_one_and_two_threads_agree():
     one, two = (
         run_with_threads(lambda: values_and_gradients(lambda x, *flat: mlp(x, pairs(flat)), inputs), n) for n in (1, 2)
     )
-    assert torch.equal(one[0], two[0]) and torch.equal(one[1], two[1]), "samples do not share sums"
+    assert torch.equal(one[0], two[0]) and torch.equal(one[1], two[1]), "sums depend on threads"
     for a, b in zip(one, two, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4)

@@ -1,4 +1,4 @@
-"""Rays through an occupancy grid, and the cells that hold their samples."""
+"""Ray marching through an occupancy grid, and marking of the samples' cells."""
 
 import math
 from dataclasses import replace
@@ -44,16 +44,16 @@ def test_march_matches_loop_over_rays_and_steps(training: bool, resolution: int,
         part = slice(int(actual.offsets[r]), int(actual.offsets[r + 1]))
         assert (actual.ray[part] == r).all()
         got = torch.stack([actual.t[part], actual.dt[part]], dim=-1)
-        # Rounding may decide on a midpoint that lies on a border of cells, or on an interval of no length.
-        got, wanted = got[got[:, 1] > 1e-5], torch.tensor([e for e in expected if e[1] > 1e-5]).view(-1, 2)
-        torch.testing.assert_close(got, wanted, rtol=1e-4, atol=1e-4)
-        total += len(wanted)
+        # Rounding decides midpoints on cell borders and intervals of length 0.
+        got, expected_kept = got[got[:, 1] > 1e-5], torch.tensor([e for e in expected if e[1] > 1e-5]).view(-1, 2)
+        torch.testing.assert_close(got, expected_kept, rtol=1e-4, atol=1e-4)
+        total += len(expected_kept)
     assert total > 100
 
 
-@pytest.mark.parametrize("away", [2.0, 300.0])
-def test_march_along_walls_matches_reference(away: float):
-    """Where rounding decides on which side of a wall a step lies, a leap must not decide otherwise."""
+@pytest.mark.parametrize("distance", [2.0, 300.0])
+def test_march_along_walls_matches_reference(distance: float):
+    """Leaps agree with the reference where rounding decides on which side of a wall a step lies."""
     grid = torch.zeros(16, 16, 16, dtype=torch.bool)
     grid[:, 8:, :] = True  # from the wall of a block on
     total = 0
@@ -64,15 +64,15 @@ def test_march_along_walls_matches_reference(away: float):
             torch.stack([torch.ones(500), sideways, 0.1 * torch.rand(500, generator=generator)], 1), dim=1
         )
         at = torch.stack([torch.zeros(500), 1e-6 * torch.randn(500, generator=generator), torch.zeros(500)], 1)
-        rays, found = Rays(at - away * direction, direction), []
+        rays, results = Rays(at - distance * direction, direction), []
         for version in ("reference", "auto"):
             set_kernels(version)
             step = 2 * 3**0.5 / 4000
-            found.append(
+            results.append(
                 Samples(*march(rays, CUBE, *CUBE.near_far(rays), torch.zeros(500), grid.flatten(), 4000, step))
             )
-        assert torch.equal(found[0].t, found[1].t) and torch.equal(found[0].offsets, found[1].offsets)
-        total += len(found[0])
+        assert torch.equal(results[0].t, results[1].t) and torch.equal(results[0].offsets, results[1].offsets)
+        total += len(results[0])
     assert total > 1e5
 
 
@@ -98,39 +98,39 @@ STEP = 2 * math.sqrt(3) / 100
 
 
 def shells(positions: Tensor) -> Tensor:
-    """Fog in shells, and nothing between them."""
+    """Density of fog in shells."""
     return 40 * (12 * positions.norm(dim=1)).sin().clamp_min(0)
 
 
-def looked(rays: Rays, occupied: Tensor) -> tuple[Tensor, Packed, int]:
-    """Thickness and intervals, and how many positions were asked for."""
-    asked = []
+def march_shells(rays: Rays, occupied: Tensor) -> tuple[Tensor, Packed, int]:
+    """Optical depths and intervals, and the number of queried positions."""
+    queries = []
 
     def optical_depth(packed: Packed) -> Tensor:
-        asked.append(len(packed[0]))
+        queries.append(len(packed[0]))
         t, dt, ray, _ = packed
         return shells(rays.origins.detach()[ray] + t[:, None] * rays.directions[ray]) * dt
 
     near, far = CUBE.near_far(rays)
     shift = torch.rand(near.shape, generator=torch.Generator().manual_seed(3))
-    found, packed = march_until_opaque(rays, CUBE, near, far, shift, occupied, 100, STEP, optical_depth, EPS)
-    return found, packed, sum(asked)
+    depths, packed = march_until_opaque(rays, CUBE, near, far, shift, occupied, 100, STEP, optical_depth, EPS)
+    return depths, packed, sum(queries)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_march_until_opaque_any_occupancy_finds_visible_samples(share: float):
+@pytest.mark.parametrize("occupied_fraction", [0.0, 0.3, 1.0])
+def test_march_until_opaque_any_occupancy_finds_visible_samples(occupied_fraction: float):
     directions = normalize(torch.randn(400, 3), dim=1)
-    aside = torch.cat([torch.rand(396, 3) - 0.5, torch.full((4, 3), 5.0)])  # the last miss
-    rays = Rays(aside - 4 * directions, directions)
-    occupied = torch.rand(16**3) < share
+    offsets = torch.cat([torch.rand(396, 3) - 0.5, torch.full((4, 3), 5.0)])  # the last miss
+    rays = Rays(offsets - 4 * directions, directions)
+    occupied = torch.rand(16**3) < occupied_fraction
     set_kernels("reference")
-    expected, every, most = looked(rays, occupied)
+    expected, every, most = march_shells(rays, occupied)
     set_kernels("auto")
-    found, packed, asked = looked(rays, occupied)
+    depths, packed, queries = march_shells(rays, occupied)
     for min_optical_depth in (0.0, 0.05):
-        kept, which = filter_visible(found, packed, EPS, min_optical_depth)
-        wanted, those = filter_visible(expected, every, EPS, min_optical_depth)
-        assert all(torch.equal(a, b) for a, b in zip((kept, *which), (wanted, *those), strict=True))
-    assert asked == len(found) and (len(found) < 0.7 * most or share < 1)
-    again = run_with_threads(lambda: looked(rays, occupied), 2 if torch.get_num_threads() == 1 else 1)
-    assert torch.equal(found, again[0]) and torch.equal(packed[0], again[1][0])
+        kept, intervals = filter_visible(depths, packed, EPS, min_optical_depth)
+        expected_kept, others = filter_visible(expected, every, EPS, min_optical_depth)
+        assert all(torch.equal(a, b) for a, b in zip((kept, *intervals), (expected_kept, *others), strict=True))
+    assert queries == len(depths) and (len(depths) < 0.7 * most or occupied_fraction < 1)
+    again = run_with_threads(lambda: march_shells(rays, occupied), 2 if torch.get_num_threads() == 1 else 1)
+    assert torch.equal(depths, again[0]) and torch.equal(packed[0], again[1][0])

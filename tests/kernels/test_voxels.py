@@ -14,7 +14,7 @@ SIDE = 6
 
 
 def sparse_index(side: int = SIDE) -> Tensor:
-    """Rows of a grid's vertices, a third of which are not kept."""
+    """Rows of a grid's vertices, a third of which are pruned."""
     kept = torch.rand(side**3) > 1 / 3
     return torch.where(kept, kept.cumsum(0), 0).int()
 
@@ -27,8 +27,8 @@ def vertices_of(index: Tensor) -> Tensor:
     return torch.cat([torch.tensor([-1]), index.nonzero()[:, 0]]).int()
 
 
-def places(count: int) -> Tensor:
-    """Positions within the unit cube, on its faces and outside."""
+def positions(count: int) -> Tensor:
+    """Positions inside the unit cube, on its faces and outside."""
     return torch.cat([torch.rand(count, 3), torch.tensor([[0.0, 0, 0], [1, 1, 1], [-0.5, 0.3, 2]])])
 
 
@@ -53,7 +53,7 @@ def brute_force(values: Tensor, index: Tensor, position: list[float]) -> Tensor:
 
 
 def test_interpolate_voxels_any_position_matches_loop_over_vertices(kernels: str):
-    index, unit = sparse_index(), places(20)
+    index, unit = sparse_index(), positions(20)
     density, colour, views = tables(index, 3)
     basis = basis_of(len(unit), 3)
     raw, rgb = interpolate_voxels(density, colour, views, *locate_vertices(index, unit), basis)
@@ -72,11 +72,11 @@ def test_total_variation_matches_loop_over_neighbours(kernels: str):
     vertex, rows = vertices_of(index), rows_of(index)
     grid, squares = index.view(SIDE, SIDE, SIDE), 0.0
     for at in range(SIDE**3):
-        place = [at // SIDE**2, at // SIDE % SIDE, at % SIDE]
+        corner = [at // SIDE**2, at // SIDE % SIDE, at % SIDE]
         for axis in range(3):
             for sign in (-1, 1):
-                other = list(place)
+                other = list(corner)
                 other[axis] += sign
-                if 0 <= other[axis] < SIDE and grid[tuple(place)] > 0 and grid[tuple(other)] > 0:
-                    squares += float(values[grid[tuple(place)]] - values[grid[tuple(other)]]) ** 2
+                if 0 <= other[axis] < SIDE and grid[tuple(corner)] > 0 and grid[tuple(other)] > 0:
+                    squares += float(values[grid[tuple(corner)]] - values[grid[tuple(other)]]) ** 2
     assert float(total_variation(values, vertex, index, 1, rows)) == pytest.approx(squares / (rows - 1), rel=1e-5)

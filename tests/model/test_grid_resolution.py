@@ -45,7 +45,7 @@ Resolutions = Callable[[Bounds, int, int, str], list[int]]
 @pytest.mark.parametrize(("unbounded", "across"), [(False, 20), (True, 40)])
 def test_pixels_across_are_of_unit_cube(unbounded: bool, across: int):
     assert Bounds(BOX, unbounded, pixel_footprint=0.1).unit_cube_pixels == pytest.approx(across)
-    # A step of one pixel along the longest axis is one part in so many of the unit cube.
+    # One pixel along the longest axis is 1 / across of the unit cube.
     bounds = Bounds(BOX, unbounded, pixel_footprint=0.1)
     step = bounds.to_unit(torch.tensor([0.1, 0, 0])) - bounds.to_unit(torch.zeros(3))
     assert float(step[0]) == pytest.approx(1 / across)
@@ -57,9 +57,9 @@ def test_grid_auto_size_has_two_cells_a_pixel_at_most(resolutions: Resolutions):
     auto, fixed = resolutions(bounds, 16, 100, "auto"), resolutions(bounds, 16, 100, "fixed")
     assert auto[0] == fixed[0] == 16 and auto[-1] == 40 and fixed[-1] == 100
     assert resolutions(bounds, 16, 30, "auto") == resolutions(bounds, 16, 30, "fixed")
-    assert resolutions(Bounds(BOX), 16, 100, "auto") == fixed, "without photos sizes are as asked"
+    assert resolutions(Bounds(BOX), 16, 100, "auto") == fixed, "no limit without photos"
     assert set(resolutions(Bounds(BOX, pixel_footprint=0.5), 16, 100, "auto")) == {8}, (
-        "few pixels lower the coarsest too"
+        "few pixels limit the base resolution too"
     )
 
 
@@ -68,31 +68,31 @@ def test_grid_auto_size_has_two_cells_a_pixel_at_most(resolutions: Resolutions):
     [(False, 150, 160, 32), (False, 450, 240, 48), (False, 9000, 320, 64), (True, 800, 160, 32)],
 )
 def test_tensorf_large_photos_enlarge_planes_and_network(unbounded: bool, across: int, max_resolution: int, width: int):
-    """Planes have numbers in proportion to the width of the photos, the network neurons in proportion to the planes' side."""
+    """Plane entries scale with the width of the photos, neurons with the resolution of the planes."""
     bounds = Bounds(BOX, unbounded, pixel_footprint=2 / across)
-    field, given = TensoRFField(bounds, 2, 2), TensoRFField(bounds, 2, 2, max_resolution=100, width=24)
+    field, explicit = TensoRFField(bounds, 2, 2), TensoRFField(bounds, 2, 2, max_resolution=100, width=24)
     assert field.resolutions[-1] == max_resolution and field.colour_net[0].out_features == width
-    assert given.resolutions[-1] == 100 and given.colour_net[0].out_features == 24
+    assert explicit.resolutions[-1] == 100 and explicit.colour_net[0].out_features == 24
     assert TensoRFField(bounds, 2, 2, max_resolution=100).colour_net[0].out_features == 32
     assert TensoRFField(Bounds(BOX, unbounded), 2, 2, base_resolution=200).resolutions[-1] == 200
 
 
 def test_run_on_large_photos_has_finer_field(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(bounds, "USUAL_WIDTH", 4)  # so that small photos count as large
+    monkeypatch.setattr(bounds, "REFERENCE_WIDTH_PX", 4)  # so that small photos count as large
     monkeypatch.setattr(planes, "MIN_STEPS_PER_STAGE", 2)
-    monkeypatch.setattr(planes, "FINEST", 24)
+    monkeypatch.setattr(planes, "DEFAULT_MAX_RESOLUTION", 24)
     save_npz(make_object_scene(MARBLE, size=24, views=5, held_out=1), tmp_path / "scene.npz")
-    given = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "model.base_resolution=8"]
-    given += ["model.size=fixed", "model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "~logger"]
-    told: list[float] = []
-    monkeypatch.setattr(RayDataModule, "note_samples", lambda data, drawn: told.append(data._resolution_scale))
+    args = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "model.base_resolution=8"]
+    args += ["model.size=fixed", "model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "~logger"]
+    scales: list[float] = []
+    monkeypatch.setattr(RayDataModule, "adapt_num_rays", lambda data, drawn: scales.append(data._resolution_scale))
     train(
         compose_config(
-            [*given, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "budget.steps=7"], tmp_path / "run"
+            [*args, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "budget.steps=7"], tmp_path / "run"
         )
     )
-    found = load_run(tmp_path / "run").system
-    finer = found.field.resolution_scale
-    assert told == [1.0] * 4 + [finer] * 3, "the data aims for more samples once the field is finer"
-    assert finer > 1.1 and found.sampler.samples == 3 * found.sampler.grid.resolution > 192 * 1.1
-    assert found.field.resolutions[-1] == round(24 * finer)
+    system = load_run(tmp_path / "run").system
+    scale = system.field.resolution_scale
+    assert scales == [1.0] * 4 + [scale] * 3, "the target number of samples follows the field's resolution"
+    assert scale > 1.1 and system.sampler.samples == 3 * system.sampler.grid.resolution > 192 * 1.1
+    assert system.field.resolutions[-1] == round(24 * scale)

@@ -1,4 +1,4 @@
-"""Activations, encodings, levels of a hash grid, and how finely colours depend on the direction."""
+"""Activations, encodings, hash-grid levels, and the degree of view dependence."""
 
 import math
 
@@ -75,13 +75,12 @@ BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
 def test_colours_vary_with_direction_up_to_degree(kind: type, degree: int, kernels: str):
-    """Where every ReLU stays open, the logits of a colour are a polynomial of that degree in the direction: around a circle
-    their Fourier series ends there."""
+    """With all ReLUs active, colour logits are polynomials of that degree: on a circle their Fourier series ends there."""
     field = kind(BOX, degree=degree, width=8)
     first, *others = field.colour_net
     first.bias.data += 4.0
     for layer in others:
-        layer.weight.data -= layer.weight.data.mean(1, keepdim=True)  # so that the 4 is not seen behind it
+        layer.weight.data -= layer.weight.data.mean(1, keepdim=True)  # cancels the constant 4 of the layer before
         layer.bias.data.fill_(4.0 if layer is not others[-1] else 0.0)
     turn = torch.arange(16) * (2 * torch.pi / 16)
     plane = torch.linalg.qr(torch.randn(3, 2)).Q

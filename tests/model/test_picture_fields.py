@@ -1,4 +1,4 @@
-"""Fields of pictures: what they learn, where their vertices and frequencies lie, and their first weights."""
+"""Picture fields: training, positions of vertices, frequencies, and initialization."""
 
 import functools
 import math
@@ -37,7 +37,7 @@ def test_picture_field_any_size_learns_with_all_parameters(make, size: tuple[int
 
 @FIELDS
 def test_picture_field_smooth_picture_is_learned(make):
-    """100 steps on a smooth picture leave less than a twentieth of the squared error of the best plain colour."""
+    """100 steps reduce the squared error below a twentieth of that of the best constant colour."""
     x, y = pixel_grid(48, 64).T
     smooth = torch.stack([0.5 + 0.4 * torch.sin(5 * x), 0.5 + 0.4 * torch.cos(4 * y + 2 * x), 0.2 + 0.6 * x * y], dim=1)
     image = (255 * smooth).round().byte().view(48, 64, 3)
@@ -54,7 +54,7 @@ def test_picture_field_smooth_picture_is_learned(make):
         return [system.query_rgb(view.uv)]
 
     view = data.get_held_out_view(0)
-    (learned,) = run_with_threads(train, 1)  # steps so small are slower with two, and far slower on a busy machine
+    (learned,) = run_with_threads(train, 1)  # two threads are slower for such small steps
     assert psnr(learned, view.rgb) > psnr(view.rgb.mean(0).expand_as(view.rgb), view.rgb) + 13
 
 

@@ -73,7 +73,7 @@ def test_tensorf_state_of_any_stage_loads(saved_at: float, loaded_at: float):
     saved, loaded = field(), field()
     grow(saved, saved_at)
     grow(loaded, loaded_at)
-    wrapped = torch.nn.ModuleDict({"field": loaded})  # as a system holds it
+    wrapped = torch.nn.ModuleDict({"field": loaded})  # as in a system
     wrapped.load_state_dict(torch.nn.ModuleDict({"field": saved}).state_dict())
     x, d = positions(), directions()
     for ours, theirs in zip(loaded(x, d)[:2], saved(x, d)[:2], strict=True):

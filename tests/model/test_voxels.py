@@ -25,7 +25,7 @@ def directions(count: int = 200) -> torch.Tensor:
 
 
 def read_positions(voxels: VoxelField, low: float = 0.0, high: float = 1.0, count: int = 3000) -> torch.Tensor:
-    """Reads the field, as training does, at places in a part of the box. Returns the places."""
+    """Reads the field at positions in a part of the box, as training does. Returns the positions."""
     at = BOX.to_world(low + (high - low) * torch.rand(count, 3))
     voxels(at, directions(count))
     return at
@@ -52,7 +52,7 @@ def test_voxels_upsample_keeps_values_at_read_vertices():
     replaced = grow(voxels, 0.5)
     assert [id(p) for p in replaced] == [id(table) for table in voxels.tables]
     assert len(voxels.index) == 17**3 and len(voxels.log_density) == 17**3 + 1
-    # Every second vertex of the finer grid is one of the coarser: trilinear interpolation is the same on both.
+    # Every second vertex of the fine grid is a vertex of the coarse one: interpolation agrees.
     for ours, theirs in zip(voxels(x, d)[:2], before, strict=True):
         torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-3)
     assert grow(voxels, 0.6) == []
@@ -60,9 +60,9 @@ def test_voxels_upsample_keeps_values_at_read_vertices():
 
 def test_voxels_upsample_drops_unread_vertices():
     voxels = field()
-    low = read_positions(voxels, high=0.2)  # only one corner of the box is looked at
+    low = read_positions(voxels, high=0.2)  # reads one corner of the box only
     with torch.no_grad():
-        voxels(positions(), directions())  # an evaluation is no training
+        voxels(positions(), directions())  # evaluation does not mark rows as read
     before = voxels.density(low)
     grow(voxels, 1.0)
     assert len(voxels.log_density) < 0.1 * 17**3
@@ -102,7 +102,7 @@ def test_voxels_tv_loss_covers_each_slice_in_turn():
     touched = torch.stack(slopes).bool().sum(0)
     assert touched[0] == 0 and (touched[1:] == 1).all()
     rows = len(voxels.vertex_of_row)
-    whole = 0.5 * total_variation(voxels.log_density, voxels.vertex_of_row, voxels.index, 1, rows)
-    (expected,) = torch.autograd.grad(whole, voxels.log_density)
+    mean = 0.5 * total_variation(voxels.log_density, voxels.vertex_of_row, voxels.index, 1, rows)
+    (expected,) = torch.autograd.grad(mean, voxels.log_density)
     torch.testing.assert_close(sum(slopes) / 4, expected, rtol=0.02, atol=1e-5)
     assert field(tv_weight=0.0).losses() == {}

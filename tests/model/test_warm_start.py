@@ -1,4 +1,4 @@
-"""Larger fields that take up what smaller ones have learned, and fields left with what some cells need."""
+"""Warm starts of larger fields, and pruning."""
 
 from collections.abc import Callable
 
@@ -31,7 +31,7 @@ def hashgrid(entries: int = 6, width: int = 8, **options: int) -> Field:
 
 
 def tensorf(components: int = 3, colours: int = 3, max_resolution: int = 6, width: int = 8, degree: int = 3) -> Field:
-    """Of numbers of components that kernels are compiled for anyway."""
+    """With numbers of components for which kernels are already compiled."""
     return TensoRFField(BOX, components, colours, max_resolution, max_resolution, stages=1, width=width, degree=degree)
 
 
@@ -59,11 +59,11 @@ def test_warm_start_larger_field_is_same_function_and_learns(make: Callable[...,
     smaller, larger = make(**small), make(**large)
     positions = BOX.to_world(torch.rand(60, 3))
     directions = normalize(torch.randn(60, 3), dim=1)
-    wanted = smaller(positions, directions)
-    assert (larger(positions, directions)[1] - wanted[1]).abs().max() > 1e-3, "it was another one"
+    target = smaller(positions, directions)
+    assert (larger(positions, directions)[1] - target[1]).abs().max() > 1e-3, "the functions differ before"
     larger.warm_start_from(smaller)
-    for found, was in zip(larger(positions, directions)[:2], wanted[:2], strict=True):
-        torch.testing.assert_close(found, was, rtol=1e-4, atol=1e-5)
+    for actual, expected in zip(larger(positions, directions)[:2], target[:2], strict=True):
+        torch.testing.assert_close(actual, expected, rtol=1e-4, atol=1e-5)
     optimizer = torch.optim.Adam(larger.parameters(), lr=1e-2)
     before = [parameter.detach().clone() for parameter in larger.parameters()]
     for _ in range(3):
@@ -109,24 +109,24 @@ def test_warm_start_larger_picture_field_is_same_function(make: Callable[..., Pi
 
 @pytest.mark.parametrize("cells", [1, 3, 8, 13])
 def test_vertices_of_cells_are_their_corners(cells: int):
-    find_visible_cells = torch.zeros(8, 8, 8, dtype=torch.bool)
-    find_visible_cells[2, 5, 7] = find_visible_cells[0, 0, 3] = True
+    visible_cells = torch.zeros(8, 8, 8, dtype=torch.bool)
+    visible_cells[2, 5, 7] = visible_cells[0, 0, 3] = True
     expected = torch.zeros(cells + 1, cells + 1, cells + 1, dtype=torch.bool)
-    for cell in find_visible_cells.nonzero():
-        places = (cell + torch.rand(3000, 3)) / 8
-        low = (places * cells).long().clamp(max=cells - 1)
+    for cell in visible_cells.nonzero():
+        samples = (cell + torch.rand(3000, 3)) / 8
+        low = (samples * cells).long().clamp(max=cells - 1)
         for corner in torch.cartesian_prod(*[torch.arange(2)] * 3):
             expected[tuple((low + corner).T)] = True
-    assert torch.equal(vertices_of_cells(find_visible_cells, cells), expected)
+    assert torch.equal(vertices_of_cells(visible_cells, cells), expected)
 
 
 @pytest.mark.parametrize("make", [hashgrid, tensorf, voxels, mlp])
 def test_prune_visible_cells_keep_their_values(make: Callable[[], Field]):
-    field, find_visible_cells = make(), torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)) < 0.02
-    cells = find_visible_cells.nonzero().repeat(20, 1)
+    field, visible_cells = make(), torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(1)) < 0.02
+    cells = visible_cells.nonzero().repeat(20, 1)
     positions = BOX.to_world((cells + torch.rand(len(cells), 3)) / 8)
     directions = normalize(torch.randn(len(positions), 3), dim=1)
     before = [part.detach() for part in field(positions, directions)[:2]]
-    field.prune(find_visible_cells)
-    for found, was in zip(field(positions, directions)[:2], before, strict=True):
-        torch.testing.assert_close(found, was)
+    field.prune(visible_cells)
+    for actual, expected in zip(field(positions, directions)[:2], before, strict=True):
+        torch.testing.assert_close(actual, expected)

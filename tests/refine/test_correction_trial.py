@@ -1,4 +1,4 @@
-"""Trials of corrections: what they say of photos of a known field, and what follows from it in training."""
+"""Correction trials on photos of a known field, and their effect on training."""
 
 from dataclasses import replace
 
@@ -46,7 +46,7 @@ def views() -> Views:
 
 
 def shift_alternately(images: Tensor, pixels: int, some: slice = slice(None)) -> Tensor:
-    """Some photos are shifted to one side, and every other of these to the other."""
+    """Shifts some photos sideways, in alternating directions."""
     images = images.clone()
     for number, view in enumerate(range(VIEWS)[some]):
         images[view] = images[view].roll(pixels * (-1) ** number, dims=1)
@@ -54,7 +54,7 @@ def shift_alternately(images: Tensor, pixels: int, some: slice = slice(None)) ->
 
 
 def run_trial(views: Views, given: Cameras | None = None) -> dict[str, float]:
-    """What a trial says of these photos, by cameras that may be others than took them."""
+    """Runs a trial on photos, with cameras that may differ from the true ones."""
     views = replace(views, cameras=given or views.cameras)
     corrections = Corrections(views.cameras, BOX, auto=True)
     before = [p.clone() for p in corrections.parameters()]
@@ -73,7 +73,7 @@ def test_trial_faulty_photos_names_fault(views: Views):
     assert run_trial(exposed)["exposure"] > 0.5 and run_trial(exposed)["poses"] < 0.1
     noise = torch.randint(-20, 21, views.images.shape)
     noisy = Views.from_images((views.images + noise).clamp(0, 255).to(torch.uint8), views.cameras)
-    assert max(run_trial(noisy).values()) < 0.02  # what is left to explain is not theirs
+    assert max(run_trial(noisy).values()) < 0.02  # noise is no fault of poses or exposure
 
 
 def test_trial_masked_pixels_are_ignored(views: Views):

@@ -33,11 +33,11 @@ VIEWS, SIZE = 5, 12
 """Photos, and pixels along a side of each."""
 STEPS = 300
 OFF = ("callbacks.orbit=null", "callbacks.snapshots=null", "callbacks.validation=null", "~logger")
-"""Callbacks whose files nobody looks at here."""
+"""Callbacks whose files are not tested here."""
 
 
 def correct_all(cameras: Cameras) -> Corrections:
-    """All that can be corrected."""
+    """All corrections."""
     return Corrections(cameras, BOX, focal=True, affine=True, vignetting=True)
 
 
@@ -89,7 +89,7 @@ def test_color_correction_gains_keep_background(cameras: Cameras):
 
 
 def fit_corrections(corrections: Corrections, truth: Corrections, cameras: Cameras) -> None:
-    """From photos of a known ball, by cameras and in light as `truth` says."""
+    """Trains corrections on photos of a known ball, with the true corrections `truth`."""
     sampler, renderer, background = UniformSampler(BOX, 32), VolumeRenderer("black"), torch.zeros(200, 3)
 
     def seen(by: Corrections, pixels: tuple[Tensor, Tensor, Tensor]) -> Tensor:
@@ -108,7 +108,7 @@ def fit_corrections(corrections: Corrections, truth: Corrections, cameras: Camer
 
 
 def test_corrections_known_field_recover_poses_and_gains(cameras: Cameras):
-    """Photos by cameras that stand elsewhere than was said, in changing light."""
+    """Photos from misplaced cameras, with varying exposure."""
     truth, corrections = Corrections(cameras, BOX), Corrections(cameras, BOX)
     torch.nn.init.normal_(truth.poses.pose_adjustment, std=0.5), torch.nn.init.normal_(truth.color.log_gains, std=0.1)
     fit_corrections(corrections, truth, cameras)
@@ -165,7 +165,7 @@ FIELDS = {
 def loss(
     field: Field, corrections: Corrections, rays: Rays, views: Tensor, samples: Samples, direction: Tensor
 ) -> Tensor:
-    """A sum over what is seen along these samples, from directions that do not follow the cameras."""
+    """Sum over the rendered samples, with directions that do not follow the cameras."""
     seen = VolumeRenderer("black").to(direction.device, direction.dtype)(
         corrections.poses(rays, views), samples, lambda x, _: field(x, samples.directions(rays))
     )
@@ -243,7 +243,7 @@ def test_refine_auto_bad_silhouettes_enable_poses(tmp_path: Path):
         folder = tmp_path / str(wanted)
         train(compose_config(options, folder), folder=folder, scene=scene)
         results = json.loads((folder / "results.json").read_text())
-        assert any("outlines that no body has" in warning for warning in results["warnings"]) == wanted
+        assert any("inconsistent silhouettes" in warning for warning in results["warnings"]) == wanted
         assert any(results["corrections"]["turned_degrees"]) == wanted
 
 

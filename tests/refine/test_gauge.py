@@ -1,4 +1,4 @@
-"""Turns against the matrix exponential, and shifts of pixels against cameras that really moved."""
+"""Rotations against the matrix exponential, and projection Jacobians against moved cameras."""
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from nerf_lightning.refine.gauge import (
 
 
 def cross(rotations: Tensor) -> Tensor:
-    """Matrices that take the cross product with these vectors."""
+    """Cross-product matrices of vectors."""
     found = torch.zeros(len(rotations), 3, 3, dtype=rotations.dtype)
     found[:, [2, 0, 1], [1, 2, 0]] = rotations
     return found - found.mT

@@ -54,7 +54,7 @@ def test_render_test_path_shows_photos_and_renders(run: Path, tmp_path: Path):
 def test_render_compact_file_and_the_same_command_reuses_frames(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
-    compact, frames = export_compact(run, loss_db=9), tmp_path / "frames"
+    compact, frames = export_compact(run, max_psnr_drop=9), tmp_path / "frames"
     for there in ("cpu", "2 of them reused"):
         render(compact, frames=2, background="transparent", output=frames)
         assert there in capsys.readouterr().out

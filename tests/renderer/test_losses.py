@@ -1,4 +1,4 @@
-"""Losses of rendered rays, and their median depth, which is exact for a density that is constant within each interval."""
+"""Regularization losses, and the median depth, exact for piecewise constant density."""
 
 import math
 
@@ -13,7 +13,7 @@ from tests.helpers.ragged_samples import SAMPLE_COUNTS, make_ragged_samples
 
 
 def packed(counts: list[int]) -> tuple[torch.Tensor, Samples]:
-    """Densities of rays with so many samples each, in double precision."""
+    """Densities and samples of rays with these counts, in float64."""
     samples = make_ragged_samples(counts, torch.float64)
     return torch.rand(len(samples), dtype=torch.float64), samples
 
@@ -23,7 +23,7 @@ def weights(density: torch.Tensor, samples: Samples) -> torch.Tensor:
 
 
 def distortion_over_pairs(density: torch.Tensor, samples: Samples, scale: float) -> torch.Tensor:
-    """The formula as it stands in the paper, ray by ray and pair by pair."""
+    """The paper's formula, ray by ray and pair by pair."""
     total = torch.zeros((), dtype=torch.float64)
     for first, last in zip(samples.offsets[:-1].tolist(), samples.offsets[1:].tolist(), strict=True):
         t, dt, optical_depth = (x[first:last] for x in (samples.t, samples.dt, density * samples.dt))
@@ -66,17 +66,17 @@ def test_view_loss_has_no_gradient_of_weights():
 
 def test_view_loss_textureless_pixels_cost_more():
     density, samples = packed([6, 0, 3])
-    w, plain = weights(density, samples), torch.tensor([1.0, 0.3, 0.5], dtype=torch.float64)
+    w, texturelessness = weights(density, samples), torch.tensor([1.0, 0.3, 0.5], dtype=torch.float64)
     view_part = 0.1 + torch.rand(9, 3, dtype=torch.float64)
     sizes = w * view_part.norm(dim=1)
     extra = 10.0 * (1.0 * sizes[:6].sum() + 0.5 * sizes[6:].sum()) / 3
     torch.testing.assert_close(
-        view_loss(w, view_part, samples, plain) - view_loss(w, view_part, samples), extra, rtol=0.01, atol=0.0
+        view_loss(w, view_part, samples, texturelessness) - view_loss(w, view_part, samples), extra, rtol=0.01, atol=0.0
     )
-    nothing = torch.zeros(9, 3, dtype=torch.float64, requires_grad=True)
-    loss = view_loss(w, nothing, samples, plain)
+    zeros = torch.zeros(9, 3, dtype=torch.float64, requires_grad=True)
+    loss = view_loss(w, zeros, samples, texturelessness)
     loss.backward()
-    assert loss == 0 and nothing.grad is not None and not nothing.grad.any()
+    assert loss == 0 and zeros.grad is not None and not zeros.grad.any()
 
 
 @pytest.mark.parametrize("counts", SAMPLE_COUNTS[1:3])
@@ -84,17 +84,17 @@ def test_median_depth_halves_opacity(counts: list[int]):
     samples = make_ragged_samples(counts, torch.float64)
     density = 4 * torch.rand(len(samples), dtype=torch.float64)
 
-    def before(ray: int, distance: float) -> float:
-        """The opacity up to a distance, interval by interval."""
-        own = slice(samples.offsets[ray], samples.offsets[ray + 1])
-        start = samples.t[own] - samples.dt[own] / 2
-        return 1 - math.exp(-float((density[own] * (distance - start).clamp_min(0).minimum(samples.dt[own])).sum()))
+    def opacity_before(ray: int, distance: float) -> float:
+        """Opacity of a ray up to a distance, interval by interval."""
+        part = slice(samples.offsets[ray], samples.offsets[ray + 1])
+        start = samples.t[part] - samples.dt[part] / 2
+        return 1 - math.exp(-float((density[part] * (distance - start).clamp_min(0).minimum(samples.dt[part])).sum()))
 
-    opacity = torch.tensor([before(ray, math.inf) for ray in range(len(counts))], dtype=torch.float64)
+    opacity = torch.tensor([opacity_before(ray, math.inf) for ray in range(len(counts))], dtype=torch.float64)
     depth = median_depth(density, opacity, samples)
     for ray, count in enumerate(counts):
         if count:
-            assert before(ray, float(depth[ray])) == pytest.approx(float(opacity[ray]) / 2, rel=1e-6)
+            assert opacity_before(ray, float(depth[ray])) == pytest.approx(float(opacity[ray]) / 2, rel=1e-6)
         else:
             assert depth[ray] == 0
 

@@ -17,7 +17,7 @@ def along_z(count: int, dtype: torch.dtype = torch.float32) -> Rays:
 
 
 def fixed(density: Tensor, rgb: Tensor):
-    """A field that gives the samples these answers, one after the other."""
+    """A field with this density and colour per sample."""
     return lambda positions, directions: (density, rgb)
 
 
@@ -26,7 +26,7 @@ def test_render_matches_loop_over_samples(kernels: str):
     samples, rays = make_ragged_samples(counts), along_z(3)
     density, rgb = 5 * torch.rand(10), torch.rand(10, 3)
     behind = torch.rand(3, 3)
-    seen = VolumeRenderer()(rays, samples, fixed(density, rgb), behind)
+    output = VolumeRenderer()(rays, samples, fixed(density, rgb), behind)
     i = 0
     for ray, count in enumerate(counts):
         left, colour, depth = 1.0, torch.zeros(3), 0.0
@@ -34,9 +34,9 @@ def test_render_matches_loop_over_samples(kernels: str):
             weight = left * float(-torch.expm1(-density[i] * samples.dt[i]))
             colour, depth, left = colour + weight * rgb[i], depth + weight * float(samples.t[i]), left - weight
             i += 1
-        torch.testing.assert_close(seen.rgb[ray], colour + left * behind[ray], rtol=1e-4, atol=1e-5)
-        assert float(seen.opacity[ray]) == pytest.approx(1 - left, abs=1e-5)
-        assert float(seen.depth[ray]) == pytest.approx(depth / (1 - left) if count else 0, rel=1e-4)
+        torch.testing.assert_close(output.rgb[ray], colour + left * behind[ray], rtol=1e-4, atol=1e-5)
+        assert float(output.opacity[ray]) == pytest.approx(1 - left, abs=1e-5)
+        assert float(output.depth[ray]) == pytest.approx(depth / (1 - left) if count else 0, rel=1e-4)
 
 
 @pytest.mark.parametrize("distance", [0.3, 2.5])
@@ -46,9 +46,9 @@ def test_render_thin_wall_depth_is_its_distance(distance: float, kernels: str):
     def wall(positions: Tensor, directions: Tensor):
         return 1e6 * ((positions[:, 2] - distance).abs() < 0.02).float(), torch.ones(len(positions), 3)
 
-    seen = VolumeRenderer("black")(rays, UniformSampler(box, 300)(rays, lambda x: x[:, 0]), wall)
-    torch.testing.assert_close(seen.depth, torch.full((2,), distance), atol=0.03, rtol=0)
-    torch.testing.assert_close(seen.opacity, torch.ones(2))
+    output = VolumeRenderer("black")(rays, UniformSampler(box, 300)(rays, lambda x: x[:, 0]), wall)
+    torch.testing.assert_close(output.depth, torch.full((2,), distance), atol=0.03, rtol=0)
+    torch.testing.assert_close(output.opacity, torch.ones(2))
 
 
 @pytest.mark.parametrize(
@@ -62,11 +62,11 @@ def test_render_thin_wall_depth_is_its_distance(distance: float, kernels: str):
 def test_render_uncovered_part_shows_background(background, colour, sigma, kernels: str):
     samples = make_ragged_samples([5])
     red = torch.tensor([1.0, 0, 0]).repeat(5, 1)
-    seen = VolumeRenderer(background, SCENE)(along_z(1), samples, fixed(torch.full((5,), sigma), red))
+    output = VolumeRenderer(background, SCENE)(along_z(1), samples, fixed(torch.full((5,), sigma), red))
     opacity = -torch.expm1(-sigma * samples.dt.sum())
-    torch.testing.assert_close(seen.opacity[0], opacity)
-    torch.testing.assert_close(seen.rgb[0], opacity * red[0] + (1 - opacity) * torch.tensor(colour).float())
-    assert (float(seen.depth) == 0) == (sigma == 0)
+    torch.testing.assert_close(output.opacity[0], opacity)
+    torch.testing.assert_close(output.rgb[0], opacity * red[0] + (1 - opacity) * torch.tensor(colour).float())
+    assert (float(output.depth) == 0) == (sigma == 0)
 
 
 def test_render_without_gradient_returns_no_sample_tensors():
@@ -83,8 +83,8 @@ def test_backgrounds_random_need_generator():
     assert torch.equal(first, again) and not torch.equal(first, other)
     assert first.std(0).min() > 0.2 and first.min() >= 0 and first.max() <= 1
     assert torch.equal(renderer.background.sample(2), torch.tensor(SCENE).expand(2, 3))
-    plain = VolumeRenderer("white").background.sample(2, Generator())
-    assert torch.equal(plain, torch.ones(2, 3))
+    colours = VolumeRenderer("white").background.sample(2, Generator())
+    assert torch.equal(colours, torch.ones(2, 3))
 
 
 @pytest.mark.parametrize("background", ["green", [0.1, 0.2, 0.3, 0.4], [0, 0, 1.5]])

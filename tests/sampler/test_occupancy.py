@@ -19,34 +19,31 @@ def seeded(seed: int = 3) -> Generator:
 
 def rays_toward_cube(count: int, seed: int) -> Rays:
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=seeded(seed)), dim=-1)
-    aside = torch.rand(count, 3, generator=seeded(seed + 1)) - 0.5
-    return Rays(aside - 4 * directions, directions)
+    offsets = torch.rand(count, 3, generator=seeded(seed + 1)) - 0.5
+    return Rays(offsets - 4 * directions, directions)
 
 
 def test_occupancy_solid_interior_is_queried_on_full_passes_only():
-    """A hard ball: training asks the field in its shell alone, but for the first step after each update.
-
-    Where rays do not go front first, which would hide it.
-    """
+    """A hard ball: training queries its shell alone, except on full passes. Without front-to-back marching, which hides it."""
     set_kernels("reference")
     sampler = OccupancySampler(CUBE, samples=100, resolution=16, visibility_window=2)
-    asked: list[Tensor] = []
+    queries: list[Tensor] = []
 
     def solid(x: Tensor) -> Tensor:
-        asked.append(x)
+        queries.append(x)
         return 500.0 * (x.norm(dim=-1) < 0.6).float()
 
     deepest = []
     for step in range(16 * 6):
         sampler.update(step, solid, seeded(step))
-        asked.clear()
+        queries.clear()
         sampler(rays_toward_cube(200, step), solid, seeded(step))
-        deepest.append(min(float(x.norm(dim=-1).min()) for x in asked))
-    assert all(deepest[step] < 0.2 for step in range(32)), "everywhere at first"
+        deepest.append(min(float(x.norm(dim=-1).min()) for x in queries))
+    assert all(deepest[step] < 0.2 for step in range(32)), "all cells are active at first"
     assert all((deepest[step] < 0.2) == (step % 16 == 0) for step in range(64, 96))
     assert min(deepest[step] for step in range(64, 96) if step % 16) > 0.6 - 0.4
     sampler(rays_toward_cube(200, 1000), solid)
-    assert asked[-1].norm(dim=-1).min() < 0.2, "pictures look at all that is occupied"
+    assert queries[-1].norm(dim=-1).min() < 0.2, "evaluation marches through all occupied cells"
 
 
 def test_occupancy_cell_visible_again_is_active_again():
@@ -71,7 +68,7 @@ def ball(centre: float = 0.0):
 
 
 def cells(resolution: int) -> tuple[Tensor, float]:
-    """Centres of all cells of the cube, and from there to their corners."""
+    """Centres of all cells of the cube, and the distance from centre to corner."""
     middle = (torch.arange(resolution) + 0.5) / resolution * 2 - 1
     return torch.cartesian_prod(middle, middle, middle), math.sqrt(3) / resolution
 
@@ -82,7 +79,7 @@ def test_occupancy_updates_find_content():
     centre, corner = cells(12)
     for step in range(0, 800, 16):
         sampler.update(step, ball(), seeded(step))
-        assert sampler.grid.occupied[centre.norm(dim=-1) < 0.5 - corner].all(), "never without content"
+        assert sampler.grid.occupied[centre.norm(dim=-1) < 0.5 - corner].all(), "occupied cells stay occupied"
     assert not sampler.grid.occupied[centre.norm(dim=-1) > 0.5 + corner].any()
 
 
@@ -102,7 +99,7 @@ def test_occupancy_unbounded_scene_is_learned_outside_box():
 
 
 def test_occupancy_mark_invisible_cells_requires_min_cameras():
-    """Three cameras look along x from -4; a fourth, alone, looks along y: only what three see may hold anything."""
+    """Three cameras look along x from -4, a fourth along y: only cells in view of three may be occupied."""
     eyes = torch.tensor([[-4.0, -0.1, 0], [-4, 0, 0], [-4, 0.1, 0], [0, -4, 0]])
     targets = torch.tensor([[0.0, -0.1, 0], [0, 0, 0], [0, 0.1, 0], [0, 0, 0]])
     c2w = look_at(eyes, targets, torch.tensor([0.0, 0, 1]))
@@ -113,13 +110,13 @@ def test_occupancy_mark_invisible_cells_requires_min_cameras():
     grid = sampler.grid.occupied.view(16, 16, 16)
     assert grid[:, 8, 8].all() and grid[2, 8, 8] and not grid[8, 0, 8] and not grid[8, 8, 0]
     assert torch.equal(grid, sampler.grid.in_view.view(16, 16, 16)) and sampler.grid.active.sum() <= grid.sum()
-    # Through the lone camera's beam nothing is found but where the others look too.
+    # Along the fourth camera's view samples lie only where the others look too.
     along_y = Rays(torch.tensor([[0.0, -4, 0]]), torch.tensor([[0.0, 1, 0]]))
-    found = sampler(along_y, lambda x: torch.full((len(x),), 0.1)).positions(along_y)
-    assert len(found) and found[:, 1].abs().max() < 0.7
+    positions = sampler(along_y, lambda x: torch.full((len(x),), 0.1)).positions(along_y)
+    assert len(positions) and positions[:, 1].abs().max() < 0.7
     near = OccupancySampler(replace(CUBE, near=4.0), samples=100, resolution=16, min_cameras=3)
     near.mark_invisible_cells(Cameras.pinhole(K, c2w, 16, 16))
-    assert not near.grid.in_view.view(16, 16, 16)[2, 8, 8], "nearer than rays begin"
+    assert not near.grid.in_view.view(16, 16, 16)[2, 8, 8], "before the near distance"
 
 
 def test_occupancy_resize_keeps_maximum(monkeypatch: pytest.MonkeyPatch):
@@ -134,8 +131,8 @@ def test_occupancy_resize_keeps_maximum(monkeypatch: pytest.MonkeyPatch):
     for name, old in before.items():
         new = getattr(sampler.grid, name).view(12, 12, 12)
         for x, y, z in ((0, 0, 0), (1, 5, 11), (4, 7, 10)):
-            held = [(n * 8 // 12, ((n + 1) * 8 - 1) // 12) for n in (x, y, z)]
-            expected = max(float(old[i, j, k]) for i in held[0] for j in held[1] for k in held[2])
+            ranges = [(n * 8 // 12, ((n + 1) * 8 - 1) // 12) for n in (x, y, z)]
+            expected = max(float(old[i, j, k]) for i in ranges[0] for j in ranges[1] for k in ranges[2])
             assert float(new[x, y, z]) == expected, name
     sampler.requested_samples = None
     sampler.set_resolution_scale(3.0)
@@ -147,13 +144,13 @@ def test_occupancy_state_of_any_stage_loads():
     early, late = OccupancySampler(CUBE), OccupancySampler(CUBE)
     late.set_resolution_scale(1.25)
     late.grid.occupied = torch.rand(80**3) < 0.5
-    whole, least = OccupancySampler(CUBE), OccupancySampler(CUBE)
-    whole.load_state_dict(late.state_dict())
-    least.import_state(late.export_state())
-    for loaded in (whole, least):
+    full, rendering = OccupancySampler(CUBE), OccupancySampler(CUBE)
+    full.load_state_dict(late.state_dict())
+    rendering.import_state(late.export_state())
+    for loaded in (full, rendering):
         assert torch.equal(loaded.grid.occupied, late.grid.occupied) and loaded.samples == late.samples == 240
-    whole.load_state_dict(early.state_dict())
-    assert whole.samples == 192 and len(whole.grid.optical_depth) == 64**3
+    full.load_state_dict(early.state_dict())
+    assert full.samples == 192 and len(full.grid.optical_depth) == 64**3
 
 
 def test_occupancy_steps_behind_wall_or_in_empty_space_are_dropped():
@@ -174,7 +171,7 @@ def test_occupancy_evaluation_keeps_fog(density: float, box: Bounds, rays: Rays,
     sampler = OccupancySampler(box, samples=40, resolution=6)
     near, far = box.near_far(rays)
     step = sampler.step_size(sampler.samples)
-    everything = march(rays, box, near, far, torch.zeros_like(near), sampler.grid.occupied, 40, step)[1].sum()
-    lost = density * (everything - sampler(rays, lambda x: torch.full((len(x),), density)).dt.sum())
-    assert 0 <= lost <= len(rays) * INVISIBLE_DEPTH * (1 + 1e-5)
-    assert lost > 0 or density * step > INVISIBLE_DEPTH
+    total = march(rays, box, near, far, torch.zeros_like(near), sampler.grid.occupied, 40, step)[1].sum()
+    dropped = density * (total - sampler(rays, lambda x: torch.full((len(x),), density)).dt.sum())
+    assert 0 <= dropped <= len(rays) * INVISIBLE_DEPTH * (1 + 1e-5)
+    assert dropped > 0 or density * step > INVISIBLE_DEPTH

@@ -13,12 +13,12 @@ from nerf_lightning.sampler.samples import Histogram
 UNBOUNDED = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True, near=0.1)
 
 
-def zero_density(places: torch.Tensor) -> torch.Tensor:
-    return torch.zeros(len(places))
+def zero_density(positions: torch.Tensor) -> torch.Tensor:
+    return torch.zeros(len(positions))
 
 
 def rays(count: int, seed: int = 0) -> Rays:
-    """From a ring around the origin towards places near it."""
+    """Rays from a ring around the origin toward points near it."""
     generator = Generator().manual_seed(seed)
     turn = 6.28 * torch.rand(count, generator=generator)
     origins = torch.stack([2 * turn.cos(), 2 * turn.sin(), 0.5 * torch.ones(count)], dim=1)
@@ -26,21 +26,21 @@ def rays(count: int, seed: int = 0) -> Rays:
     return Rays(origins, torch.nn.functional.normalize(targets - origins, dim=1))
 
 
-def ball(places: torch.Tensor) -> torch.Tensor:
-    """Density of a ball around the origin, and of a shell far away."""
-    far = places.norm(dim=1)
-    return 30.0 * ((far < 0.3) | (far > 4)).float()
+def ball(positions: torch.Tensor) -> torch.Tensor:
+    """Density of a ball around the origin and a distant shell."""
+    radius = positions.norm(dim=1)
+    return 30.0 * ((radius < 0.3) | (radius > 4)).float()
 
 
 def train_sampler(sampler: ProposalSampler, steps: int) -> ProposalSampler:
-    """After some steps beside a field that does not change."""
+    """Trains the proposals against a fixed field."""
     optimizer = torch.optim.Adam(sampler.parameters(), lr=0.05)
     for step in range(steps):
         generator = Generator().manual_seed(step)
-        some = rays(256, step)
+        batch = rays(256, step)
         sampler.update(step, ball, generator)
-        samples = sampler(some, ball, generator)
-        weights = volume_weights(ball(samples.positions(some)), samples.dt, samples.ray, samples.offsets)
+        samples = sampler(batch, ball, generator)
+        weights = volume_weights(ball(samples.positions(batch)), samples.dt, samples.ray, samples.offsets)
         loss = sampler.losses(samples, weights)["interlevel"]
         assert loss is not None
         optimizer.zero_grad()
@@ -49,23 +49,23 @@ def train_sampler(sampler: ProposalSampler, steps: int) -> ProposalSampler:
     return sampler
 
 
-def fraction_on_surfaces(samples: Samples, some: Rays) -> float:
-    """Share of the samples within 0.1 of where the ball or the shell begins."""
-    far = samples.positions(some).norm(dim=1)
-    return float((((far - 0.3).abs() < 0.1) | ((far - 4).abs() < 0.4)).float().mean())
+def fraction_on_surfaces(samples: Samples, batch: Rays) -> float:
+    """Fraction of the samples near the surface of the ball or the shell."""
+    radius = samples.positions(batch).norm(dim=1)
+    return float((((radius - 0.3).abs() < 0.1) | ((radius - 4).abs() < 0.4)).float().mean())
 
 
 def test_proposal_sampler_after_training_finds_surfaces():
     small = ProposalSampler(UNBOUNDED, anneal=20)
-    some = rays(200, 99)
-    before = fraction_on_surfaces(small(some, ball), some)
-    after = fraction_on_surfaces(train_sampler(small, 60)(some, ball), some)
+    batch = rays(200, 99)
+    before = fraction_on_surfaces(small(batch, ball), batch)
+    after = fraction_on_surfaces(train_sampler(small, 60)(batch, ball), batch)
     assert before < 0.25 and after > 0.5
 
 
 def test_proposal_sampler_samples_tile_ray():
-    sampler, some = ProposalSampler(UNBOUNDED, samples=10), rays(30)
-    samples = sampler(some, zero_density, Generator().manual_seed(1))
+    sampler, batch = ProposalSampler(UNBOUNDED, samples=10), rays(30)
+    samples = sampler(batch, zero_density, Generator().manual_seed(1))
     t, dt = samples.t.view(30, 10), samples.dt.view(30, 10)
     assert samples.offsets.tolist() == list(range(0, 301, 10))
     assert torch.equal(samples.ray, torch.arange(30).repeat_interleave(10))
@@ -75,11 +75,11 @@ def test_proposal_sampler_samples_tile_ray():
 
 def test_interlevel_loss_only_unexpected_weight_costs():
     edges = torch.linspace(0, 1, 5)[None]
-    found = torch.tensor([[0.0, 0.2, 0.5, 0.0]])
+    main_weights = torch.tensor([[0.0, 0.2, 0.5, 0.0]])
 
     def cost(*proposed: float) -> torch.Tensor:
         weights = torch.tensor([proposed], requires_grad=True)
-        loss = interlevel_loss(edges, found, Histogram(torch.linspace(0, 1, len(proposed) + 1)[None], weights))
+        loss = interlevel_loss(edges, main_weights, Histogram(torch.linspace(0, 1, len(proposed) + 1)[None], weights))
         loss.backward()
         return torch.cat([loss.detach()[None], weights.grad[0]])
 
@@ -91,9 +91,9 @@ def test_interlevel_loss_only_unexpected_weight_costs():
 
 
 def test_proposal_sampler_state_export_renders_alike():
-    sampler, other, some = train_sampler(ProposalSampler(UNBOUNDED), 20), ProposalSampler(UNBOUNDED), rays(20)
+    sampler, other, batch = train_sampler(ProposalSampler(UNBOUNDED), 20), ProposalSampler(UNBOUNDED), rays(20)
     other.import_state(sampler.export_state())
-    assert torch.equal(sampler(some, ball).t, other(some, ball).t)
+    assert torch.equal(sampler(batch, ball).t, other(batch, ball).t)
     with pytest.raises(RuntimeError, match="size mismatch"):
         ProposalSampler(UNBOUNDED, max_resolution=48).import_state(sampler.export_state())
 

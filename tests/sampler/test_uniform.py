@@ -1,4 +1,4 @@
-"""Samplers that know no occupancy: equal steps, and steps where the weight is."""
+"""Uniform, stratified and importance sampling."""
 
 from dataclasses import replace
 
@@ -49,20 +49,20 @@ def test_uniform_sampler_jitter_stays_in_stratum(unbounded: bool, box: Bounds, r
     torch.testing.assert_close(jittered[0][:, [0, -1]], sampler.edges(rays, None)[:, [0, -1]])
     inner = jittered[:, :, 1:-1]
     assert (inner >= strata[:, :-1] - 1e-4).all() and (inner <= strata[:, 1:] + 1e-4).all()
-    share = (inner - strata[:, :-1]) / strata.diff(dim=1)
-    assert share.amin() < 0.05 and share.amax() > 0.95, "and uses the whole of it"
-    assert unbounded or abs(float(share.mean()) - 0.5) < 0.05
+    fraction = (inner - strata[:, :-1]) / strata.diff(dim=1)
+    assert fraction.amin() < 0.05 and fraction.amax() > 0.95, "jitter covers the stratum"
+    assert unbounded or abs(float(fraction.mean()) - 0.5) < 0.05
 
 
 def test_invert_cdf_inverts_cumulated_weights():
     edges, u = torch.rand(20, 11).cumsum(1), torch.rand(20, 40)
     weights = torch.rand(20, 10) * (torch.rand(20, 10) < 0.3)
-    weights[0] = 0  # falls back to uniform in the interval's number
-    found = invert_cdf(edges, weights, u)
+    weights[0] = 0  # falls back to uniform over the intervals
+    distances = invert_cdf(edges, weights, u)
     for r in range(20):
         cdf = torch.cat([torch.zeros(1), (weights[r].double() + 1e-5).cumsum(0)])
-        # What counts is the probability mass between the two answers: distances jump where there is no weight.
-        mass = np.interp(found[r], edges[r], cdf / cdf[-1]) - u[r].numpy()
+        # Compares probability mass: distances jump where there is no weight.
+        mass = np.interp(distances[r], edges[r], cdf / cdf[-1]) - u[r].numpy()
         assert np.abs(mass).max() < 1e-4
 
 

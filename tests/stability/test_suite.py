@@ -75,7 +75,7 @@ def test_run_trial_is_done_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 def test_run_trial_excess_frequencies_fail_between_pixels(tmp_path: Path):
     result = run_trial(Trial("2D: L = 40", "2D mlp", 0, 150), tmp_path)
-    assert result.status == "finished" and "between its pixels" in result.alarm
+    assert result.status == "finished" and "off the pixel grid" in result.alarm
     assert result.psnr is not None and result.psnr < 15
 
 
@@ -96,7 +96,7 @@ def test_run_trials_processes_end_with_generator(tmp_path: Path):
         ("clean", replace(GOOD, status="collapsed"), False),
         ("OpenGL poses", replace(GOOD, psnr=None, status="refused"), True),
         ("OpenGL poses", GOOD, False),
-        ("shuffled poses", replace(GOOD, alarm="outlines that no body has"), True),
+        ("shuffled poses", replace(GOOD, alarm="inconsistent silhouettes"), True),
         ("world x10", replace(GOOD, psnr=29.5), True),
         ("world x10", replace(GOOD, psnr=28.5), False),
     ],

@@ -1,4 +1,4 @@
-"""The built-in scene against closed forms, ray-by-ray tracing in double precision, and its own geometry."""
+"""The built-in scene against closed forms and ray-by-ray tracing in double precision."""
 
 import math
 

@@ -44,7 +44,7 @@ def test_trace_rays_of_two_primitives_hits_nearer():
 
 
 def test_make_object_scene_shows_sphere_at_its_size():
-    """A ball of radius 0.3 at distance 4 in a field of 0.7: about 3 % of the photo."""
+    """A sphere of radius 0.3 at distance 4, field of view 0.7 rad: about 3 % of the photo."""
     scene = make_object_scene(MARBLE, (1.0, 1.0, 1.0))
     shown = (scene.train.images != 255).any(-1).float().mean()
     assert float(shown) == pytest.approx(math.pi * 0.3**2 / (8 * math.tan(0.35)) ** 2, rel=0.2)

@@ -111,7 +111,7 @@ class Wave(PictureField):
 
 def test_measure_off_grid_psnr_wave_matches_closed_form(sunset):
     system = NeRF2D(Wave((20, 20)), ADAM_FACTORY, constant)
-    # Neighbours of the wave are 18 degrees apart: their mean falls short of it by 1 - cos(9 degrees).
+    # Neighbouring samples of the wave differ by 18 degrees: their mean falls short of it by 1 - cos(9 degrees).
     expected = -10 * math.log10((0.4 * (1 - math.cos(math.radians(9)))) ** 2 / 2)
     found = system.measure_off_grid_psnr(PictureBatch(sunset.uv, system.query_rgb(sunset.uv), 20, 20))
     assert found == pytest.approx(expected, abs=0.3)

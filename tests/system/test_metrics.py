@@ -42,4 +42,4 @@ def test_ssim_separate_strips_gives_mean_of_strips():
     image, truth = torch.rand(2, 36, 23, 3)
     alone = [ssim(image[start : start + 12], truth[start : start + 12]) for start in (0, 12, 24)]
     assert ssim(image, truth, strip=12) == pytest.approx(sum(alone) / 3, abs=1e-6)
-    assert math.isnan(ssim(image, truth, strip=1)), "rows that lie apart have no windows"
+    assert math.isnan(ssim(image, truth, strip=1)), "separate rows have no windows"

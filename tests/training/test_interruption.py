@@ -1,4 +1,4 @@
-"""Runs that end before they are done, asked to or on a full disk: what is done is kept, and resuming gives the same weights."""
+"""Interrupted runs, by a signal or a full disk: progress is kept, and resuming gives the same weights."""
 
 import json
 import resource
@@ -49,7 +49,7 @@ def temporary_files() -> list[Path]:
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory: pytest.TempPathFactory, isolated_cache: None) -> Path:
-    """The folder of a run that nothing befell."""
+    """The folder of an uninterrupted run."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     train(compose_config(SMALL, folder), folder=folder)
     return folder
@@ -58,7 +58,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, isolated_cache: None) 
 def at_step(
     monkeypatch: pytest.MonkeyPatch, kind: type, hook: str, action: Callable[[], None], step: int = STOP
 ) -> None:
-    """Does something at the beginning of a callback's hook, after some steps, once."""
+    """Runs an action once, at the start of a callback's hook after some steps."""
     before, done = getattr(kind, hook), []
 
     def hooked(self: Any, *given: Any) -> Any:
@@ -107,7 +107,7 @@ def test_train_signal_before_training_writes_nothing(run_cli, monkeypatch: pytes
 
 @pytest.fixture
 def limit() -> Iterator[Callable[[int], None]]:
-    """Sets the size of files beyond which writing fails, as on a full disk."""
+    """Limits file sizes, so that writing fails as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -130,10 +130,10 @@ def test_train_out_of_memory_raises_and_writes_nothing(run_cli, tmp_path: Path, 
 
 @pytest.mark.parametrize("room", [0, 5000])
 def test_train_full_disk_keeps_last_checkpoint(room: int, undisturbed: Path, run_cli, limit, monkeypatch):
-    """Nothing fits at all, or checkpoints alone do not."""
+    """Either no file fits, or only checkpoints do not."""
     with monkeypatch.context() as patch:
         at_step(patch, ProgressBar, "on_train_batch_end", lambda: limit(room))
-        # Who reads what the process has said needs files too.
+        # pytest's capture needs files too.
         patch.setattr("nerf_lightning.cli.app.exit_with_error", lift_limit(limit))
         code, _, err = run_cli(*SMALL, "logger=null", "callbacks.checkpoints.every_seconds=1e-9", "name=broken")
     assert code == 2 and err.count("\n") == 1 and "no space left on the device" in err, err

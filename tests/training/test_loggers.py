@@ -1,4 +1,4 @@
-"""Where curves go: each logger gets the figures of training, the options and the final figures."""
+"""Loggers: each gets the training metrics, the options and the final metrics."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""Lightning's precisions: those that are let through train every kind of field; tests/config/test_cli.py has the others."""
+"""Supported precisions train every kind of field; tests of the command line cover the others."""
 
 import math
 from pathlib import Path

@@ -21,7 +21,7 @@ def test_repeatability_covers_every_shipped_model():
 
 @pytest.fixture
 def threads() -> Iterator[None]:
-    """Runs set them for their whole process; the next test finds them as they were."""
+    """Restores process-wide settings after each test."""
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)

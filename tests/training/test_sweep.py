@@ -1,4 +1,4 @@
-"""Sweeps: done once, taken up where they stopped, and no job's failure is another's."""
+"""Sweeps: jobs run once, resume where they stopped, and fail independently."""
 
 import csv
 import json
@@ -109,10 +109,10 @@ def test_sweep_bad_input_exits_with_code_2(arguments: list[str], words: str, run
 @pytest.mark.filterwarnings("ignore")  # Optuna warns, and here warnings are errors
 def test_sweep_by_optuna_repeats_its_trials_and_records_failures(run_cli, tmp_path: Path, capfd):
     line = ["+experiment=tune_picture", "dataset.max_side=16", "budget.steps=2", "hydra.sweeper.n_trials=2", *BARE]
-    told = [run_cli(*line), run_cli(*line)]
-    assert [code for code, _, _ in told] == [0, 0], told
-    assert [out.count(": starts") for _, out, _ in told] == [2, 0]
-    assert [out.count("done before") for _, out, _ in told] == [0, 2]
+    outputs = [run_cli(*line), run_cli(*line)]
+    assert [code for code, _, _ in outputs] == [0, 0], outputs
+    assert [out.count(": starts") for _, out, _ in outputs] == [2, 0]
+    assert [out.count("done before") for _, out, _ in outputs] == [0, 2]
     with pytest.raises(ValueError, match="No trials are completed"):
         run_cli(*line, "model.base_resolution=0")
     out, err = capfd.readouterr()
@@ -123,7 +123,7 @@ def test_sweep_by_optuna_repeats_its_trials_and_records_failures(run_cli, tmp_pa
 @pytest.mark.long
 @pytest.mark.parametrize("launcher", ["joblib", "submitit_local"])
 def test_sweep_other_launchers_finish(launcher: str, tmp_path: Path):
-    """In processes of their own, whose way back to this package must work."""
+    """Launchers that run jobs in other processes, which must import this package."""
     settings, jobs = {
         "joblib": (["model.width=8,-1", "hydra.launcher.n_jobs=2"], 2),
         "submitit_local": (["+model.lr_scale=-1", "seed=0", "threads=1"], 1),  # each job is a process
@@ -155,12 +155,12 @@ def test_train_two_processes_write_one_folder(run_cli, tmp_path: Path):
     done = run_process(*options, "trainer=ddp", "name=two", cwd=tmp_path)
     assert done.returncode == 0 and not re.search(r"\.py:\d+: ", done.stderr), done.stderr  # no library has remarks
     results = []
-    for name, told in (("one", out), ("two", done.stdout)):
+    for name, output in (("one", out), ("two", done.stdout)):
         folder = tmp_path / "outputs" / name / "latest"
         results.append(json.loads((folder / "results.json").read_text()))
         assert len(list(folder.rglob("results.json"))) == 1
         assert (folder / "checkpoints" / "last.ckpt").stat().st_size > 0
-        assert told.count("everything is in") == 1
+        assert output.count("everything is in") == 1
     one, two = results
     assert abs(one["psnr"] - two["psnr"]) < 1.0 and one["psnr"] > 15
     assert (two["steps"], two["status"]) == (200, "finished")

@@ -33,7 +33,7 @@ def orbit() -> Cameras:
 def make_request(**changes: Any) -> ViewRequest:
     c2w = look_at(CENTRE + torch.tensor([3.0, 0, 0]), CENTRE, UP).double().numpy()
     given = {"c2w": c2w, "fov": 0.8, "aspect": 1.5, "channel": "rgb", "background": BLUE, "near": 0.0, "far": math.inf}
-    return ViewRequest(**{**given, "most": 60, **changes})
+    return ViewRequest(**{**given, "max_side": 60, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -96,17 +96,17 @@ def page() -> Iterator[FieldPage]:
 def test_field_page_sends_coarse_then_finer_images_then_rests(page: FieldPage):
     browser = Browser()
     assert not page.render_next()
-    page._welcome(browser)
+    page._add_client(browser)
     page.painter.rays_per_second = 24 * 24 / 0.08
     while page.render_next():
         page.painter.rays_per_second = 24 * 24 / 0.08
     sides = [picture.shape[1] for picture in browser.pictures]
     assert sides[0] < 40 and sides[-1] == 96 and sides == sorted(set(sides))
     page.background.value = "white"
-    page._want()
+    page._request_images()
     assert page.render_next()
     assert browser.pictures[-1][0, 0].tolist() == [255, 255, 255]
-    page._farewell(browser)
+    page._remove_client(browser)
     assert not page.render_next()
 
 
@@ -130,7 +130,7 @@ def test_live_shows_progress_and_does_not_change_training(tmp_path: Path, monkey
         reports.append((share, words))
         show(self, share, words)
         if "done" in words:  # the browser gets one more image, and closes the page
-            browser.scene.set_background_image = lambda *args, **given: self._farewell(browser)
+            browser.scene.set_background_image = lambda *args, **given: self._remove_client(browser)
 
     welcomed = FieldPage.__init__
 

@@ -1,1 +1,1 @@
-"""From corners in photos to the camera and where it stood."""
+"""Camera calibration and poses from detected tags."""

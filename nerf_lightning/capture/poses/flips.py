@@ -1,9 +1,9 @@
-"""Which of a flat tag's two poses is right, by the order in which photos were taken.
+"""Resolves the two-fold ambiguity of planar poses by the order in which photos were taken.
 
-A flat tag seen nearly from the front has two poses of about the same reprojection error, and noise decides between them. But
-photos are taken one after the other, and the directions they look from change little between neighbours. Each photo's direction
-is predicted by the mean of its neighbours', again and again, as their poses get more certain; how far off the predictions are
-tells what they are worth. Photos in no order predict badly, and keep their best pose each.
+A planar tag seen nearly head-on has two poses of about the same reprojection error, and noise decides between them. But
+viewing directions change little between consecutive photos: each photo's direction is predicted as the weighted mean of its
+neighbours', iteratively, and the spread of the prediction errors sets the prior's weight. Unordered photos predict each other
+badly and keep their best pose.
 """
 
 from collections.abc import Sequence
@@ -15,35 +15,35 @@ from nerf_lightning.capture.poses.geometry import invert_pose
 from nerf_lightning.capture.poses.planar_pnp import Hypothesis
 
 NEIGHBOUR_STD_PHOTOS = 1.5, 2.0, 3.0
-"""Standard deviations, in photos, of the weights of neighbours; the one that predicts best is taken."""
+"""Standard deviations, in photos, of the neighbours' Gaussian weights; the one that predicts best is used."""
 NUM_ITERATIONS = 10
 JUMP_PROBABILITY = 0.01
-"""That a photo was taken from anywhere, whatever its neighbours."""
+"""Prior probability that a photo's direction is independent of its neighbours'."""
 MIN_PHOTOS = 4
-"""Below which there is nothing to learn from their order."""
+"""Fewest photos whose order is used."""
 
 
 def resolve_flips(hypotheses: Sequence[Sequence[Hypothesis]], points: Sequence[Float[np.ndarray, "_ 3"]]) -> list[int]:
-    """Chooses a pose for each photo: the one most probable by its reprojection error and the photos beside it.
+    """Selects each photo's most probable pose, by its reprojection error and the neighbouring photos.
 
     Args:
         hypotheses: at least one for each photo, best first; photos in the order taken.
-        points: in the world, that each photo shows; metres.
+        points: world points that each photo shows, metres.
 
     Returns:
-        The index chosen in each list.
+        The selected index in each list.
     """
     if len(hypotheses) < MIN_PHOTOS:
         return [0] * len(hypotheses)
-    # Six numbers were fitted to each photo: the remaining residuals are the noise.
-    spare = sum(max(2 * len(visible_points) - 6, 1) for visible_points in points)
-    variance = max(sum(options[0].sum_of_squares for options in hypotheses) / spare, 1e-4)
+    # Each photo's pose takes six degrees of freedom; the remaining residuals are noise.
+    degrees_of_freedom = sum(max(2 * len(visible_points) - 6, 1) for visible_points in points)
+    variance = max(sum(options[0].sum_of_squares for options in hypotheses) / degrees_of_freedom, 1e-4)
     likelihoods = [
         np.exp([(options[0].sum_of_squares - h.sum_of_squares) / (2 * variance) for h in options])
         for options in hypotheses
     ]
-    middle = np.median([visible_points.mean(0) for visible_points in points], axis=0)
-    offsets = [np.stack([invert_pose(h.pose)[:3, 3] - middle for h in options]) for options in hypotheses]
+    centre = np.median([visible_points.mean(0) for visible_points in points], axis=0)
+    offsets = [np.stack([invert_pose(h.pose)[:3, 3] - centre for h in options]) for options in hypotheses]
     directions = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in offsets]
     lag = np.subtract.outer(np.arange(len(points)), np.arange(len(points)))
     kernels = [np.exp(-((lag / width) ** 2) / 2) * (lag != 0) for width in NEIGHBOUR_STD_PHOTOS]
@@ -53,7 +53,7 @@ def resolve_flips(hypotheses: Sequence[Sequence[Hypothesis]], points: Sequence[F
         fits = []
         for kernel in kernels:
             predicted = kernel @ means / kernel.sum(1, keepdims=True)
-            squares = [((each - one) ** 2).sum(1) for each, one in zip(directions, predicted, strict=True)]
+            squares = [((each - mean) ** 2).sum(1) for each, mean in zip(directions, predicted, strict=True)]
             median = np.median([posterior @ each for posterior, each in zip(posteriors, squares, strict=True)])
             fits.append((median / (2 * np.log(2)), squares))  # of two Gaussian numbers' squares, by their median
         spread, squares = min(fits, key=lambda fit: fit[0])

@@ -1,4 +1,4 @@
-"""Camera poses from marks: every solution that flat tags allow."""
+"""Perspective-n-point for planar tags, with both solutions of the pose ambiguity."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ from nerf_lightning.dataset.intrinsics import Intrinsics
 
 Pose = Float[np.ndarray, "4 4"]
 MIN_POSE_DIFFERENCE_RAD = np.radians(1.0)
-"""Solutions that differ by less count as one."""
+"""Rotation below which two solutions count as one."""
 MAX_HYPOTHESES = 2
-"""Solutions kept a photo."""
+"""Most solutions per photo."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One place where a camera may have stood."""
+    """A candidate pose with its reprojection error."""
 
     pose: Pose
     """World (or tag) to camera."""
@@ -37,7 +37,7 @@ class Hypothesis:
 def evaluate_pose(
     lens: Intrinsics, pose: Pose, points: Float[np.ndarray, "M 3"], pixels: Float[np.ndarray, "M 2"]
 ) -> Hypothesis:
-    """A pose with its reprojection error, which is infinite where a point is behind the camera."""
+    """Computes a pose's reprojection error, infinite if a point is behind the camera."""
     if (apply_pose(pose, points)[:, 2] <= 0).any():
         return Hypothesis(pose, float("inf"))
     return Hypothesis(pose, float(((project_points(lens, pose, points) - pixels) ** 2).sum()))
@@ -46,50 +46,50 @@ def evaluate_pose(
 def refine_pose(
     lens: Intrinsics, pose: Pose, points: Float[np.ndarray, "M 3"], pixels: Float[np.ndarray, "M 2"]
 ) -> Hypothesis:
-    """The nearest minimum of the reprojection error (Levenberg-Marquardt)."""
+    """Refines a pose by Levenberg-Marquardt on the reprojection error."""
     rotation, translation = cv2.solvePnPRefineLM(
         points, pixels, lens.K, lens.opencv_distortion, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
     )
-    better = rotvec_to_matrix(rotation.reshape(3), translation.reshape(3))
+    refined = rotvec_to_matrix(rotation.reshape(3), translation.reshape(3))
     return min(
-        evaluate_pose(lens, better, points, pixels),
+        evaluate_pose(lens, refined, points, pixels),
         evaluate_pose(lens, pose, points, pixels),
         key=lambda h: h.sum_of_squares,
     )
 
 
 def deduplicate(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best ones, best first, without repeats."""
+    """The best distinct hypotheses, best first."""
     unique: list[Hypothesis] = []
-    for one in sorted(hypotheses, key=lambda h: h.sum_of_squares):
-        if np.isfinite(one.sum_of_squares) and all(
-            angle_between(one.pose, k.pose) > MIN_POSE_DIFFERENCE_RAD for k in unique
+    for candidate in sorted(hypotheses, key=lambda h: h.sum_of_squares):
+        if np.isfinite(candidate.sum_of_squares) and all(
+            angle_between(candidate.pose, kept.pose) > MIN_POSE_DIFFERENCE_RAD for kept in unique
         ):
-            unique.append(one)
+            unique.append(candidate)
     return unique[:MAX_HYPOTHESES]
 
 
 def estimate_tag_poses(lens: Intrinsics, detection: TagDetection) -> list[Hypothesis]:
-    """Tag to camera from one flat mark: one solution or two, best first.
+    """Tag-to-camera poses from one planar tag: one or two solutions, best first.
 
-    A flat target seen from afar looks the same from two sides (Collins and Bartoli 2014, "Infinitesimal plane-based pose
-    estimation"), and its own reprojection error often cannot tell which one is right.
+    A planar target seen from afar has two poses (Collins and Bartoli 2014, "Infinitesimal plane-based pose estimation")
+    that its reprojection error often cannot distinguish.
     """
     distortion = lens.opencv_distortion
-    found, turns, shifts, _ = cv2.solvePnPGeneric(
+    ok, turns, shifts, _ = cv2.solvePnPGeneric(
         detection.points, detection.pixels, lens.K, distortion, flags=cv2.SOLVEPNP_IPPE
     )
-    poses = [rotvec_to_matrix(r.reshape(3), t.reshape(3)) for r, t in zip(turns, shifts, strict=True)] if found else []
+    poses = [rotvec_to_matrix(r.reshape(3), t.reshape(3)) for r, t in zip(turns, shifts, strict=True)] if ok else []
     return deduplicate([refine_pose(lens, pose, detection.points, detection.pixels) for pose in poses])
 
 
 def estimate_camera_poses(
     lens: Intrinsics, detections: dict[int, TagDetection], tags: Mapping[int, Pose]
 ) -> list[Hypothesis]:
-    """World to camera from all marks of a photo together, best first.
+    """World-to-camera poses from all tags of a photo together, best first.
 
     Args:
-        detections: by tag; those without a place in `tags` are left out.
+        detections: by tag; those not in `tags` are ignored.
         tags: tag to world.
     """
     known = {tag: detection for tag, detection in detections.items() if tag in tags}
@@ -106,7 +106,7 @@ def estimate_camera_poses(
 def collect_correspondences(
     detections: Mapping[int, TagDetection], tags: Mapping[int, Pose]
 ) -> tuple[Float[np.ndarray, "M 3"], Float[np.ndarray, "M 2"]]:
-    """Points of a photo's known tags in the world, and where the photo shows them."""
+    """World points of a photo's known tags, and their pixels."""
     known = {tag: detection for tag, detection in detections.items() if tag in tags}
     points = [apply_pose(tags[tag], detection.points) for tag, detection in known.items()]
     return np.concatenate(points), np.concatenate([detection.pixels for detection in known.values()])

@@ -1,4 +1,4 @@
-"""Where the tags lie and where the cameras stood, from the photos alone."""
+"""Solves tag and camera poses from the photos alone."""
 
 import logging
 from collections import Counter, defaultdict
@@ -30,27 +30,23 @@ from nerf_lightning.errors import InputError
 
 log = logging.getLogger(__name__)
 
-MAX_DISAGREEMENT_RAD = np.radians(10.0)
-"""Two photos say the same of two tags if they differ by less than this angle, and ..."""
-MAX_DISAGREEMENT_FRACTION = 0.25
-"""... by less than this share of the tags' distance (or of a tag, where they touch)."""
-OUTLIER_RATIO = 4.0
-"""A photo is off if its error is more than this times the median, and also above ..."""
-MIN_OUTLIER_PX = 1.0
-"""... this at 1000 pixels along the longest side."""
+MAX_DISAGREEMENT_RAD, MAX_DISAGREEMENT_FRACTION = np.radians(10.0), 0.25
+"""Two photos agree on the relative pose of two tags within this rotation, and this fraction of the tags' distance."""
+OUTLIER_RATIO, MIN_OUTLIER_PX = 4.0, 1.0
+"""Outliers have errors above this multiple of the median, and above this many pixels at 1000 px along the longest side."""
 
 
 @dataclass(frozen=True)
 class PoseSolution:
-    """Cameras and tags in one frame."""
+    """Camera and tag poses in one world frame."""
 
     refined: RefinedBundle
     photos: tuple[str, ...]
-    """Names of the photos that were placed, in the order of `refined`."""
+    """Names of the registered photos, in the order of `refined`."""
     ids: tuple[int, ...]
-    """Of the tags, in the order of `refined`."""
+    """Tag ids, in the order of `refined`."""
     fixed: frozenset[int]
-    """Which of the tags, counted in the order of `ids`, hold the world in place."""
+    """Indices in `ids` of the tags that fix the world frame."""
 
     @property
     def lens(self) -> Intrinsics:
@@ -63,11 +59,11 @@ class PoseSolution:
 
     @property
     def w2c(self) -> dict[str, Pose]:
-        """World to camera, by the photo's name."""
+        """World to camera, by photo name."""
         return dict(zip(self.photos, self.refined.bundle.w2c, strict=True))
 
     def residuals_by_tag(self, photo: str) -> dict[int, Float[np.ndarray, "_ 2"]]:
-        """Projected minus seen, pixels, by the tag's id."""
+        """Residuals (projected - detected), pixels, by tag id."""
         number = self.photos.index(photo)
         detections = self.refined.bundle.detections[number]
         ends = np.cumsum([len(detection.pixels) for detection in detections.values()])[:-1]
@@ -77,19 +73,19 @@ class PoseSolution:
 
 @dataclass(frozen=True)
 class RegisteredPhoto:
-    """A photo with its camera, or the reason why it has none."""
+    """A photo with its pose, or the reason why it has none."""
 
     observation: PhotoObservation
     reason: str = ""
-    """Why it was left out; "" if it was placed."""
+    """Why it was excluded; "" if it was registered."""
     c2w: Pose | None = None
     """OpenCV frame, metres."""
     reprojection_px: float | None = None
-    """Root mean square reprojection error."""
+    """RMS reprojection error."""
     residuals: dict[int, Float[np.ndarray, "_ 2"]] = field(default_factory=dict)
-    """Projected minus seen, pixels, by the tag's id."""
+    """Residuals (projected - detected), pixels, by tag id."""
     method: str = ""
-    """"texture" if it shows no tag, and was placed against the photos that do; "" if as the others."""
+    """"texture" if it shows no tag and was registered against the photos that do; else ""."""
 
     @property
     def name(self) -> str:
@@ -99,30 +95,30 @@ class RegisteredPhoto:
 def estimate_relative_poses(
     observations: Sequence[Mapping[int, list[Hypothesis]]],
 ) -> dict[tuple[int, int], tuple[Pose, int]]:
-    """The motion from one tag's frame to another's that most photos agree on, and how many do.
+    """Relative pose of each pair of tags that most photos agree on, and their number.
 
-    Each photo offers all combinations of its tags' solutions; the right ones agree between photos, the flipped do not.
+    Each photo contributes all combinations of its tags' solutions; correct ones agree between photos, flipped ones do not.
     """
-    offers: dict[tuple[int, int], list[list[Pose]]] = defaultdict(list)
+    candidates: dict[tuple[int, int], list[list[Pose]]] = defaultdict(list)
     for poses in observations:
-        tags = sorted(tag for tag, found in poses.items() if found)
+        tags = sorted(tag for tag, solutions in poses.items() if solutions)
         for i, a in enumerate(tags):
             for b in tags[i + 1 :]:
-                offers[a, b].append([invert_pose(x.pose) @ y.pose for x in poses[a] for y in poses[b]])
-    return {pair: _find_consensus(photos) for pair, photos in offers.items()}
+                candidates[a, b].append([invert_pose(x.pose) @ y.pose for x in poses[a] for y in poses[b]])
+    return {pair: _find_consensus(photos) for pair, photos in candidates.items()}
 
 
 def _find_consensus(photos: list[list[Pose]]) -> tuple[Pose, int]:
-    """Of all motions the one that most photos agree with, the nearest ones where several do."""
-    poses = np.stack([pose for offered in photos for pose in offered])
+    """Selects the relative pose that most photos agree with; ties go to the smallest misfit."""
+    poses = np.stack([pose for candidates in photos for pose in candidates])
     turns, shifts = poses[:, :3, :3].reshape(-1, 9), poses[:, :3, 3]
     # |A - B|^2 = 8 sin^2(angle / 2) = 6 - 2 <A, B> for rotations A and B.
     chord = np.sqrt(np.clip(6 - 2 * turns @ turns.T, 0, 8) / 8)
     distance = np.linalg.norm(shifts[:, None] - shifts, axis=2)
-    reach = MAX_DISAGREEMENT_FRACTION * np.maximum(np.linalg.norm(shifts, axis=1), 1e-9)
-    off = np.stack([2 * np.arcsin(chord) / MAX_DISAGREEMENT_RAD, distance / reach[:, None]])
-    misfit = np.where((off < 1).all(0), off.sum(0), 2.0)
-    starts = np.cumsum([0, *(len(offered) for offered in photos)])[:-1]
+    tolerance = MAX_DISAGREEMENT_FRACTION * np.maximum(np.linalg.norm(shifts, axis=1), 1e-9)
+    deviation = np.stack([2 * np.arcsin(chord) / MAX_DISAGREEMENT_RAD, distance / tolerance[:, None]])
+    misfit = np.where((deviation < 1).all(0), deviation.sum(0), 2.0)
+    starts = np.cumsum([0, *(len(candidates) for candidates in photos)])[:-1]
     nearest = np.minimum.reduceat(misfit, starts, axis=1)
     count = (nearest < 2).sum(1)
     best = np.lexsort((nearest.sum(1), -count))[0]
@@ -130,10 +126,10 @@ def _find_consensus(photos: list[list[Pose]]) -> tuple[Pose, int]:
 
 
 def chain_tag_poses(pairs: Mapping[tuple[int, int], tuple[Pose, int]], reference: int) -> dict[int, Pose]:
-    """Places all tags that are linked to the reference, starting with the links that most photos agree on.
+    """Chains relative poses from the reference tag, greedily by the number of agreeing photos.
 
     Returns:
-        Tag to the reference tag's frame.
+        Poses of all linked tags in the reference tag's frame.
     """
     poses = {reference: np.eye(4)}
     while True:
@@ -153,57 +149,55 @@ def solve_poses(
     layout: Mapping[int, Pose] | None,
     free_lens: tuple[str, ...] = (),
 ) -> PoseSolution:
-    """Places photos and tags, and refines everything together.
+    """Solves the poses of photos and tags, and refines them by bundle adjustment.
 
     Args:
-        lens: a first guess, or the calibrated lens.
-        observations: photos in the order taken; those that show no tag linked to the others are not placed.
-        layout: tag to world; None solves it from the photos, in the frame of the tag seen most.
-        free_lens: parameters of the lens that may change too; see `adjust_bundle`.
+        lens: an initial guess, or the calibrated lens.
+        observations: photos in the order taken; those without a tag linked to the others are ignored.
+        layout: tag to world; None solves it from the photos, in the frame of the most detected tag.
+        free_lens: free lens parameters; see `adjust_bundle`.
 
     Raises:
-        InputError: no photo can be placed.
+        InputError: no photo can be registered.
     """
-    alone = [
+    tag_poses = [
         {tag: estimate_tag_poses(lens, detection) for tag, detection in s.detections.items()} for s in observations
     ]
-    counts = Counter(tag for poses in alone for tag, found in poses.items() if found)
-    # The smallest id among the most seen, so that the frame does not depend on the order of photos.
+    counts = Counter(tag for by_tag in tag_poses for tag, poses in by_tag.items() if poses)
+    # Ties go to the smallest id, so that the frame does not depend on the order of photos.
     reference = max(sorted(counts), key=counts.__getitem__, default=-1)
-    tags = layout if layout is not None else chain_tag_poses(estimate_relative_poses(alone), reference)
-    options = [(s, found) for s in observations if (found := estimate_camera_poses(lens, s.detections, tags))]
-    if not options:
+    tags = layout if layout is not None else chain_tag_poses(estimate_relative_poses(tag_poses), reference)
+    registered = [(s, poses) for s in observations if (poses := estimate_camera_poses(lens, s.detections, tags))]
+    if not registered:
         folder = observations[0].path.parent
         raise InputError(folder, "", "the tags fit no camera", hint="keep them flat and give their true size")
-    chosen = resolve_flips(
-        [found for _, found in options], [collect_correspondences(s.detections, tags)[0] for s, _ in options]
-    )
-    ids = tuple(sorted({tag for s, _ in options for tag in s.detections if tag in tags}))
+    points = [collect_correspondences(s.detections, tags)[0] for s, _ in registered]
+    chosen = resolve_flips([poses for _, poses in registered], points)
+    ids = tuple(sorted({tag for s, _ in registered for tag in s.detections if tag in tags}))
     row = {tag: n for n, tag in enumerate(ids)}
     bundle = Bundle(
         lens,
-        np.stack([found[c].pose for (_, found), c in zip(options, chosen, strict=True)]),
+        np.stack([poses[c].pose for (_, poses), c in zip(registered, chosen, strict=True)]),
         np.stack([tags[tag] for tag in ids]),
-        [{row[tag]: detection for tag, detection in s.detections.items() if tag in row} for s, _ in options],
+        [{row[tag]: detection for tag, detection in s.detections.items() if tag in row} for s, _ in registered],
         np.zeros(len(ids)),
     )
     fixed = frozenset(row.values()) if layout is not None else frozenset({row[reference]})
-    return PoseSolution(select_lens_model(bundle, [free_lens], fixed), tuple(s.name for s, _ in options), ids, fixed)
+    return PoseSolution(select_lens_model(bundle, [free_lens], fixed), tuple(s.name for s, _ in registered), ids, fixed)
 
 
 def select_lens_model(bundle: Bundle, models: Sequence[tuple[str, ...]], fixed: frozenset[int]) -> RefinedBundle:
-    """Refines with each lens model and takes the one of lowest BIC whose lens does not fold the picture; then the same with
-    twisted tags.
+    """Adjusts the bundle with each lens model and selects the invertible one of lowest BIC; then tries twisted tags.
 
-    Parameters that a model does not free have their plain value; a model that frees none keeps the lens.
+    Parameters that are not free take their defaults; a model without free parameters keeps the lens.
     """
     fits: list[RefinedBundle] = []
     for free in models:
-        start = fits[-1].bundle if fits else bundle  # models grow: each starts where the one before ended
+        start = fits[-1].bundle if fits else bundle  # models are nested: each starts from the previous one
         fits.append(adjust_bundle(replace(start, lens=simplify_lens(start.lens, free)), free, fixed))
-    # A polynomial fitted only to the middle of the picture may turn back; the plainest model is the fallback.
-    sound = [fit for fit in fits if fit.bundle.lens.is_invertible()] or fits[:1]
-    best = min(sound, key=lambda fit: fit.bic)
+    # A polynomial fitted only to the image centre may fold back; the simplest model is the fallback.
+    invertible = [fit for fit in fits if fit.bundle.lens.is_invertible()] or fits[:1]
+    best = min(invertible, key=lambda fit: fit.bic)
     twisted = adjust_bundle(best.bundle, models[fits.index(best)], fixed, free_twists=True)
     return min(best, twisted, key=lambda fit: fit.bic)
 
@@ -214,26 +208,26 @@ def solve_without_outliers(
     fit: Callable[[Sequence[PhotoObservation]], PoseSolution],
     min_photos: int = 1,
 ) -> tuple[PoseSolution, list[RegisteredPhoto]]:
-    """Solves again without the photos and marks that contradict the others, until none does or too few photos are left.
+    """Solves repeatedly, dropping outlier photos and tags, until there are none or too few photos remain.
 
     Args:
         observations: in the order taken.
-        exclusions: why photos are left out from the start, by name.
-        fit: solves for some of the photos.
-        min_photos: that are enough to go on.
+        exclusions: reasons by name of the photos excluded from the start.
+        fit: solves for a subset of the photos.
+        min_photos: fewest photos to continue with.
 
     Returns:
         The solution, and all photos.
     """
     reasons = {s.name: "no tag found" for s in observations if not s.detections} | dict(exclusions)
-    left = [s for s in observations if s.name not in reasons]
+    kept = [s for s in observations if s.name not in reasons]
     while True:
-        solution = fit(left)
-        remaining, off = drop_outliers(solution, left)
-        if len(remaining) < min_photos or (not off and all(a is b for a, b in zip(remaining, left, strict=True))):
+        solution = fit(kept)
+        remaining, outliers = drop_outliers(solution, kept)
+        if len(remaining) < min_photos or (not outliers and all(a is b for a, b in zip(remaining, kept, strict=True))):
             break
-        left, reasons = remaining, reasons | off
-    used, w2c = {s.name: s for s in left}, solution.w2c
+        kept, reasons = remaining, reasons | outliers
+    used, w2c = {s.name: s for s in kept}, solution.w2c
     photos = []
     for observation in observations:
         name = observation.name
@@ -250,11 +244,10 @@ def solve_without_outliers(
 def drop_outliers(
     solution: PoseSolution, observations: Sequence[PhotoObservation]
 ) -> tuple[list[PhotoObservation], dict[str, str]]:
-    """Leaves out what is off by far more than the rest: a tag that is half hidden, bent, or mistaken for another; and a photo
-    more than half of whose tags are.
+    """Drops outlier tags (half hidden, bent, or misidentified), and photos more than half of whose tags are outliers.
 
     Returns:
-        The sightings that are left, and why each photo was left out, by name.
+        The remaining observations, and why each photo was excluded, by name.
     """
     errors = solution.refined.rms
     median, side = float(np.median(errors)), max(solution.lens.width, solution.lens.height)
@@ -262,12 +255,12 @@ def drop_outliers(
     reasons, hidden = {}, {}
     for i in np.flatnonzero(errors > limit).tolist():
         name = solution.photos[i]
-        by_mark = {tag: rms_length(rest) for tag, rest in solution.residuals_by_tag(name).items()}
-        if 2 * sum(error > limit for error in by_mark.values()) > len(by_mark):
+        by_tag = {tag: rms_length(residuals) for tag, residuals in solution.residuals_by_tag(name).items()}
+        if 2 * sum(error > limit for error in by_tag.values()) > len(by_tag):
             reasons[name] = f"reprojection error {errors[i]:.1f} pixels (median {median:.2f} pixels)"
         else:
-            hidden[name] = max(by_mark, key=by_mark.__getitem__)
-            text = "%s: tag %d is ignored: it lies elsewhere than in the other photos, or is half hidden"
+            hidden[name] = max(by_tag, key=by_tag.__getitem__)
+            text = "%s: tag %d is ignored: its position contradicts the other photos, or it is half hidden"
             log.warning(text, name, hidden[name])
     remaining = [s for s in observations if s.name not in reasons]
     for i, s in enumerate(remaining):

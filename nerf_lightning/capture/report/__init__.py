@@ -1,1 +1,1 @@
-"""The pictures that tell how a capture went."""
+"""Figures for checking a capture."""

@@ -1,4 +1,4 @@
-"""The report of a capture: three pictures that show whether to trust it."""
+"""The report of a capture: contact sheet, reprojection errors and camera map."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -37,17 +37,14 @@ MAX_LABELS = 60
 
 
 def write_report(capture: Capture, folder: Path) -> list[Path]:
-    """Writes the pictures to look at after a capture.
+    """Writes the figures of a capture and returns their paths.
 
-    - `tags.png`: the photos of both folders with their tags, and why some were left out;
-    - `errors.png`: the reprojection error by photo, where in the picture corners were seen and how they are off, and the lens;
-    - `cameras.png`: the cameras, the tags, the box and the orbit of the scene, from above and from the side.
-
-    Returns:
-        The files, in this order.
+    - `tags.png`: the photos of both folders with their tags, and why some were excluded;
+    - `errors.png`: reprojection errors by photo, residuals over the image plane, and the lens parameters;
+    - `cameras.png`: cameras, tags, box and orbit of the scene, from above and from the side.
 
     Raises:
-        InputError: a photo can no longer be read: all are read again.
+        InputError: a photo can no longer be read (all are read again).
     """
     lens = capture.calibration.lens
     folders = {"calibration": capture.calibration.photos, "photos": capture.photos}
@@ -64,7 +61,7 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
 
 
 def collect_tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
-    """Corners in the world of the tags that placed photos show, by id; metres."""
+    """World positions of the tags' corners, metres, by tag id."""
     points = {
         tag: detection.points for photo in capture.photos for tag, detection in photo.observation.detections.items()
     }
@@ -72,8 +69,7 @@ def collect_tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]
 
 
 def plot_errors(folders: Mapping[str, Sequence[RegisteredPhoto]], calibration: Calibration) -> Figure:
-    """For each folder, the error of every photo, and the residuals of all corners by their place in the picture, with the hull
-    of all corners; below, the lens."""
+    """Plots each folder's reprojection errors by photo and its residuals over the image plane; below, the lens parameters."""
     figure = Figure(figsize=(18, 6.5 * len(folders)), dpi=DPI, layout="constrained")
     grid = figure.subplots(len(folders), 2, squeeze=False, width_ratios=(1.15, 1))
     for (left, right), (title, photos) in zip(grid, folders.items(), strict=True):
@@ -85,17 +81,17 @@ def plot_errors(folders: Mapping[str, Sequence[RegisteredPhoto]], calibration: C
 
 def _draw_bars(axes: Axes, title: str, photos: Sequence[RegisteredPhoto]) -> None:
     errors = {number: photo.reprojection_px or 0.0 for number, photo in enumerate(photos, 1) if not photo.reason}
-    left_out = [number for number, photo in enumerate(photos, 1) if photo.reason]
+    excluded = [number for number, photo in enumerate(photos, 1) if photo.reason]
     axes.bar(list(errors), list(errors.values()), color=BLUE)
     median = float(np.median(list(errors.values())))
     axes.axhline(median, color="black", linestyle="--", linewidth=1, label=f"median {median:.2f} px")
-    if left_out:
-        axes.plot(left_out, [0] * len(left_out), "X", color=VERMILLION, markersize=10, clip_on=False, label="left out")
+    if excluded:
+        axes.plot(excluded, [0] * len(excluded), "X", color=VERMILLION, markersize=10, clip_on=False, label="excluded")
     labelled = subsample_photos(photos, MAX_LABELS)
     labels = [f"{shorten(replace_missing_glyphs(photos[i].name), 24)}  {i + 1}" for i in labelled]
     axes.set_xticks([i + 1 for i in labelled], labels, rotation=90, fontsize=9, fontfamily=FONT, parse_math=False)
     axes.set_xlim(0.3, len(photos) + 0.7)
-    axes.set(title=f"{title}: reprojection error", ylabel="rms of a photo, pixels")
+    axes.set(title=f"{title}: reprojection error", ylabel="RMS per photo, pixels")
     axes.margins(y=0.12)
     axes.legend(loc="upper right", framealpha=0.9)
     axes.spines[["top", "right"]].set_visible(False)
@@ -103,31 +99,29 @@ def _draw_bars(axes: Axes, title: str, photos: Sequence[RegisteredPhoto]) -> Non
 
 def _draw_residuals(axes: Axes, title: str, photos: Sequence[RegisteredPhoto], lens: Intrinsics) -> None:
     set_image_axes(axes, lens.width, lens.height)
-    seen, residuals = collect_residuals(photos)
-    hull = cv2.convexHull(seen.astype(np.float32)).reshape(-1, 2)
+    pixels, residuals = collect_residuals(photos)
+    hull = cv2.convexHull(pixels.astype(np.float32)).reshape(-1, 2)
     axes.add_patch(Polygon(hull, facecolor=SKY, alpha=0.15, edgecolor="none"))
-    longest = float(np.percentile(np.linalg.norm(residuals, axis=1), 90))
-    scale = choose_magnification(longest, 0.06 * max(lens.width, lens.height))
-    axes.quiver(*seen.T, *(scale * residuals).T, angles="xy", scale_units="xy", scale=1, color=BLUE, width=0.0016)
-    covered = cv2.contourArea(hull) / (lens.width * lens.height)
-    text = (
-        f"{title}: residuals of {len(seen)} corners, {scale:g} times as long; they cover {covered:.0%} of the picture"
-    )
+    typical_length = float(np.percentile(np.linalg.norm(residuals, axis=1), 90))
+    scale = choose_magnification(typical_length, 0.06 * max(lens.width, lens.height))
+    axes.quiver(*pixels.T, *(scale * residuals).T, angles="xy", scale_units="xy", scale=1, color=BLUE, width=0.0016)
+    coverage = cv2.contourArea(hull) / (lens.width * lens.height)
+    text = f"{title}: residuals of {len(pixels)} corners, magnified {scale:g} times; they cover {coverage:.0%} of the photo"
     axes.set_title(text)
 
 
 def collect_residuals(photos: Sequence[RegisteredPhoto]) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]:
-    """Where all corners of photos that were used were seen, and projected minus seen; pixels."""
+    """Detected corners of all used photos, and their residuals (projected - detected); pixels."""
     used = [
         (photo.observation.detections[tag].pixels, rest) for photo in photos for tag, rest in photo.residuals.items()
     ]
-    seen, residuals = zip(*used, strict=True)
-    return np.concatenate(seen), np.concatenate(residuals)
+    pixels, residuals = zip(*used, strict=True)
+    return np.concatenate(pixels), np.concatenate(residuals)
 
 
 def describe_lens(calibration: Calibration) -> str:
-    """The lens in numbers, each with its standard deviation if it was set free."""
+    """Formats the lens parameters, those that were fitted with their standard deviations."""
     values = dict(zip(LENS_PARAMETERS, lens_to_vector(calibration.lens), strict=True))
     free = [f"{name} {values[name]:.5g} ± {deviation:.2g}" for name, deviation in calibration.deviations.items()]
     fixed = [name for name in LENS_PARAMETERS if name not in calibration.deviations]
-    return "set free:  " + ",   ".join(free) + (f";   kept plain: {', '.join(fixed)}" if fixed else "")
+    return "fitted:  " + ",   ".join(free) + (f";   fixed: {', '.join(fixed)}" if fixed else "")

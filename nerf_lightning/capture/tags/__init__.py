@@ -1,1 +1,1 @@
-"""Printed tags: sheets, boards, and where photos show them."""
+"""Printed tags: layouts, boards, detection, and a sheet to print."""

@@ -1,4 +1,4 @@
-"""Tags in photos: ids and corners, to a fraction of a pixel."""
+"""Tag detection in photos: ids and subpixel corners."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -21,31 +21,31 @@ COMMON_DICTIONARIES = (
     *(f"DICT_{side}X{side}_{count}" for count in (50, 1000) for side in (4, 5, 6, 7)),
     *("DICT_ARUCO_ORIGINAL", "DICT_APRILTAG_36h11", "DICT_APRILTAG_25h9", "DICT_APRILTAG_16h5"),
 )
-"""What `auto` tries, small families first: the small one of a kind holds the first patterns of the large one."""
+"""Families that `auto` tries, small ones first: each holds the first patterns of its larger one."""
 GUESS_SIDE_PX = 1600
-"""Longest side in pixels at which `auto` looks for a family."""
+"""Longest side of the photos in which `auto` looks for a family."""
 NUM_THREADS = 2
 
 
 @dataclass(frozen=True)
 class TagDetection:
-    """Known points of one tag (or board) and where a photo shows them."""
+    """Corners of one tag (or board) and their pixels in a photo."""
 
     points: Float[np.ndarray, "M 3"]
-    """In the tag's own frame, metres."""
+    """In the tag's frame, metres."""
     pixels: Float[np.ndarray, "M 2"]
-    """In the photo, pixel centres at +0.5."""
+    """Pixel centres at +0.5."""
 
 
 @dataclass(frozen=True)
 class PhotoObservation:
-    """What one photo shows."""
+    """A photo's size and detected tags."""
 
     path: Path
     width: int
     height: int
     detections: dict[int, TagDetection]
-    """By the tag's id."""
+    """By tag id."""
 
     @property
     def name(self) -> str:
@@ -53,14 +53,14 @@ class PhotoObservation:
 
 
 Detector = Callable[[UInt8[np.ndarray, "H W"]], dict[int, TagDetection]]
-"""Finds marks in a grey photo."""
+"""Detects tags in a grey photo, by id."""
 
 
 def get_dictionary(name: str) -> "cv2.aruco.Dictionary":
-    """The predefined dictionary of this name.
+    """OpenCV's predefined tag dictionary of this name.
 
     Raises:
-        InputError: on a name that OpenCV does not know.
+        InputError: OpenCV has no such dictionary.
     """
     number = getattr(cv2.aruco, name, None) if name.startswith("DICT_") else None
     if number is None:
@@ -69,95 +69,94 @@ def get_dictionary(name: str) -> "cv2.aruco.Dictionary":
 
 
 def make_tag_detector(dictionary: str, size: float) -> Detector:
-    """A detector of single square tags.
+    """Makes a detector of single square tags, with corners refined by `cornerSubPix`.
 
-    Corners are refined by `cornerSubPix` within the tag's own neighbourhood. OpenCV puts pixel centres at integers, so half a
-    pixel is added.
+    OpenCV puts pixel centres at integers, so half a pixel is added.
 
     Args:
-        dictionary: OpenCV's name of the family.
+        dictionary: OpenCV's name of the tag family.
         size: side of the black square, metres.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    parameters.cornerRefinementWinSize = 30  # OpenCV takes 0.3 modules where that is less: sharp photos are large
+    parameters.cornerRefinementWinSize = 30  # OpenCV caps it at 0.3 modules; modules are large in sharp photos
     parameters.cornerRefinementMinAccuracy = 0.005
     parameters.cornerRefinementMaxIterations = 100
     detector = cv2.aruco.ArucoDetector(get_dictionary(dictionary), parameters)
 
     def detect(grey: UInt8[np.ndarray, "H W"]) -> dict[int, TagDetection]:
         corners, ids, _ = detector.detectMarkers(grey)
-        found = [] if ids is None else [int(i) for i in np.asarray(ids).reshape(-1)]
-        twice = {tag for tag, count in Counter(found).items() if count > 1}
-        # A tag seen twice is a reflection, a second print or a mistake: there is no telling which one is meant.
+        tags = [] if ids is None else [int(i) for i in np.asarray(ids).reshape(-1)]
+        duplicates = {tag for tag, count in Counter(tags).items() if count > 1}
+        # A tag detected twice is a reflection, a second print or a false positive: both are ambiguous.
         return {
             tag: TagDetection(size * UNIT_SQUARE, np.asarray(four, np.float64).reshape(4, 2) + 0.5)
-            for tag, four in zip(found, corners, strict=True)
-            if tag not in twice
+            for tag, four in zip(tags, corners, strict=True)
+            if tag not in duplicates
         }
 
     return detect
 
 
 def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
-    """A photo, upright, in shades of grey."""
+    """Reads a photo, upright, in grey."""
     return cv2.cvtColor(read_pixels(path, upright=True)[..., :3], cv2.COLOR_RGB2GRAY)
 
 
 def detect_tags(paths: Sequence[Path], detector: Detector) -> list[PhotoObservation]:
-    """Looks for marks in photos, in the order given."""
+    """Detects tags in photos, in the given order."""
 
-    def look(path: Path) -> PhotoObservation:
+    def observe(path: Path) -> PhotoObservation:
         grey = read_grey(path)
         return PhotoObservation(path, grey.shape[1], grey.shape[0], detector(grey))
 
     with ThreadPoolExecutor(NUM_THREADS) as pool:
-        return list(track_progress(pool.map(look, paths), len(paths), "looking for tags"))
+        return list(track_progress(pool.map(observe, paths), len(paths), "detecting tags"))
 
 
 def find_wrong_sizes(
     folder: Path, photos: Sequence[PhotoObservation], size: tuple[int, int] | None = None
 ) -> dict[str, str]:
-    """Photos that do not have the commonest size (or `size`, that of the calibration), and what is wrong with each.
+    """Reasons by name of the photos without the most common size (or `size`, that of the calibration).
 
     Raises:
-        InputError: no photo is of that size.
+        InputError: no photo has that size.
     """
     width, height = size or Counter((p.width, p.height) for p in photos).most_common(1)[0][0]
-    expected = f"{width}x{height} is what {'was calibrated' if size else 'most have'}"
+    expected = f"{'the calibration has' if size else 'most have'} {width}x{height}"
     wrong = {}
     for photo in photos:
         if (photo.width, photo.height) != (width, height):
-            turned = "held the other way" if (photo.height, photo.width) == (width, height) else "of another size"
-            wrong[photo.name] = f"{photo.width}x{photo.height} pixels, {turned}: {expected}"
+            problem = "rotated by 90 degrees" if (photo.height, photo.width) == (width, height) else "of another size"
+            wrong[photo.name] = f"{photo.width}x{photo.height} pixels, {problem}: {expected}"
     if len(wrong) == len(photos):
         name, reason = next(iter(wrong.items()))
-        advice = "take both with one camera, held one way, without zooming"
+        advice = "take both with one camera in one orientation, without zooming"
         raise InputError(folder / name, "", reason, "photos of the size and orientation of the calibration", advice)
     return wrong
 
 
 def guess_dictionary(paths: Sequence[Path], photos: int = 4) -> str:
-    """The family with most tags in a few of the photos.
+    """The tag family with the most detections in a few of the photos.
 
     Raises:
-        InputError: where none of the common families is found.
+        InputError: no tag of a common family is detected.
     """
-    small = []
+    reduced = []
     for i in subsample(len(paths), photos):
         grey = read_grey(paths[i])
         size = fit_size(grey.shape[1], grey.shape[0], GUESS_SIDE_PX)
-        small.append(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
+        reduced.append(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
     counts = {}
     for name in COMMON_DICTIONARIES:
-        # Without error correction: a few wrong bits turn clutter into tags of the larger families.
+        # Without error correction, which would turn clutter into tags of the larger families.
         parameters = cv2.aruco.DetectorParameters()
         parameters.errorCorrectionRate = 0.0
         detector = cv2.aruco.ArucoDetector(get_dictionary(name), parameters)
-        counts[name] = sum(len(detector.detectMarkers(grey)[0]) for grey in small)
+        counts[name] = sum(len(detector.detectMarkers(grey)[0]) for grey in reduced)
     best = max(COMMON_DICTIONARIES, key=counts.__getitem__)
     if not counts[best]:
-        found = f"no tag of a common family in {len(small)} of {len(paths)} photos"
-        advice = "take sharp photos of tags with a white rim, or name their family with dictionary"
-        raise InputError(paths[0].parent, "", found, hint=advice)
+        problem = f"no tag of a common family in {len(reduced)} of {len(paths)} photos"
+        advice = "take sharp photos of tags with a white margin, or name their family with dictionary"
+        raise InputError(paths[0].parent, "", problem, hint=advice)
     return best

@@ -1,4 +1,4 @@
-"""A page of tags to print."""
+"""A printable sheet of tags, as PDF."""
 
 from pathlib import Path
 
@@ -14,17 +14,16 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic_write
 
 A4_METRES = 0.210, 0.297
-"""Metres."""
 RULER_METRES = 0.1
-"""Length of the line that shows whether the printer kept the size, metres."""
+"""Length of the line that verifies the print scale."""
 METRES_PER_INCH = 0.0254
 
 
 def write_sheet_pdf(layout: TagLayout, file: Path) -> None:
-    """Writes a flat sheet of tags as a PDF of its true size.
+    """Writes a planar layout of tags as a PDF at true scale.
 
     Raises:
-        InputError: the file is no PDF, or the tags do not fit on the page.
+        InputError: the file is not a PDF, or the tags do not fit on the page.
     """
     if file.suffix.lower() != ".pdf":
         raise InputError("print-tags", "sheet", str(file), "a file name that ends in .pdf")
@@ -34,21 +33,21 @@ def write_sheet_pdf(layout: TagLayout, file: Path) -> None:
 
 
 def draw_sheet(layout: TagLayout) -> Figure:
-    """A flat sheet of tags in the middle of an A4 page.
+    """Draws a planar layout of tags, centred on an A4 page.
 
     Raises:
         InputError: the tags do not fit on the page, or are not in the family.
     """
     patterns = get_dictionary(layout.dictionary)
-    if (last := max(layout.poses)) >= len(patterns.bytesList):
+    if (max_id := max(layout.poses)) >= len(patterns.bytesList):
         expected = f"one of the {len(patterns.bytesList)} tags of {layout.dictionary}"
-        raise InputError("print-tags", "layout", f"tag {last}", expected, "name a larger family with dictionary")
+        raise InputError("print-tags", "layout", f"tag {max_id}", expected, "name a larger family with dictionary")
     corners = np.concatenate([layout.corners(tag)[:, :2] for tag in layout.poses])
     low, high = corners.min(0), corners.max(0)
-    rim = layout.size / 6
-    if (high - low + 2 * rim > A4_METRES).any():
-        found = f"{1000 * (high - low)[0]:.0f} x {1000 * (high - low)[1]:.0f} mm of tags"
-        raise InputError("print-tags", "tag_size", found, "no more than an A4 page with a white rim holds", "give less")
+    margin = layout.size / 6
+    if (high - low + 2 * margin > A4_METRES).any():
+        problem = f"{1000 * (high - low)[0]:.0f} x {1000 * (high - low)[1]:.0f} mm of tags"
+        raise InputError("print-tags", "tag_size", problem, "tags that fit an A4 page with a margin", "reduce tag_size")
     figure = Figure(figsize=(A4_METRES[0] / METRES_PER_INCH, A4_METRES[1] / METRES_PER_INCH))
     axes = figure.add_axes((0, 0, 1, 1))
     centre = (low + high) / 2
@@ -59,15 +58,15 @@ def draw_sheet(layout: TagLayout) -> Figure:
     side = patterns.markerSize + 2
     module = layout.size / side
     for tag, pose in layout.poses.items():
-        black = cv2.aruco.generateImageMarker(patterns, tag, side) < 128
-        turn = float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0])))
-        for row, column in np.argwhere(black).tolist():
-            own = np.array([column * module - layout.size / 2, (side - 1 - row) * module - layout.size / 2, 0])
-            x, y, _ = pose[:3, :3] @ own + pose[:3, 3]
-            # The line hides seams between neighbours.
-            axes.add_patch(Rectangle((x, y), module, module, angle=turn, color="black", linewidth=0.2))
-    words = f"{layout.dictionary}, tags of {100 * layout.size:g} cm. Print without scaling: this line is 10 cm long."
+        is_black = cv2.aruco.generateImageMarker(patterns, tag, side) < 128
+        rotation = float(np.degrees(np.arctan2(pose[1, 0], pose[0, 0])))
+        for row, column in np.argwhere(is_black).tolist():
+            local = np.array([column * module - layout.size / 2, (side - 1 - row) * module - layout.size / 2, 0])
+            x, y, _ = pose[:3, :3] @ local + pose[:3, 3]
+            # The outline hides seams between modules.
+            axes.add_patch(Rectangle((x, y), module, module, angle=rotation, color="black", linewidth=0.2))
+    text = f"{layout.dictionary}, tags of {100 * layout.size:g} cm. Print without scaling: this line is 10 cm long."
     bottom = centre[1] - A4_METRES[1] / 2 + 0.009
     axes.plot(centre[0] + np.array([-0.5, 0.5]) * RULER_METRES, [bottom, bottom], color="black", linewidth=0.8)
-    axes.text(centre[0], bottom + 0.002, words, ha="center", va="bottom", fontsize=7)
+    axes.text(centre[0], bottom + 0.002, text, ha="center", va="bottom", fontsize=7)
     return figure

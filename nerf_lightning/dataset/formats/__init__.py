@@ -1,1 +1,1 @@
-"""Each file format that scenes and photos come in, and what is asked of a file before it is believed."""
+"""Readers of scene file formats and image files, and checks of their contents."""

@@ -1,4 +1,4 @@
-"""Checks of numbers, intrinsics and poses that all readers share. Each raises InputError: one line that a user can act on."""
+"""Validation of numbers, intrinsics and poses shared by all readers. Each check raises InputError."""
 
 import logging
 from collections.abc import Iterable, Sequence
@@ -14,18 +14,18 @@ from nerf_lightning.utils.memory import check_memory
 log = logging.getLogger(__name__)
 
 BYTES_PER_RENDERED_PIXEL = 20
-"""Memory for a pixel of a rendered view: colour, depth and opacity as floats."""
+"""Memory per rendered pixel: colour, depth and opacity as float32."""
 RIGID_TOLERANCE = 1e-3
-"""How far R^T R may stand from the identity, entry by entry; files that print six digits stay well below."""
+"""Largest deviation of R^T R from the identity, per entry; files with six digits are well below."""
 MAX_COORDINATE, MIN_CAMERA_DISTANCE = 1e12, 1e-12
-"""Largest coordinate, and smallest distance of cameras from what they look at, in a file's unit: single precision holds the
-cubes of these lengths, which a similarity's scale is taken from, and no more."""
+"""Largest coordinate and smallest camera distance, in the file's unit: float32 holds the cubes of these lengths (the
+determinants of similarities), but no larger ones."""
 MAX_FOCAL_PX = 2.0**23
-"""Largest focal length, and largest place on a sensor: single precision cannot tell two pixels apart beyond."""
+"""Largest focal length and pixel coordinate: beyond it float32 cannot resolve pixels."""
 FLOAT32_EPS = 2.0**-23
-"""Between neighbouring numbers of single precision, as a share of them."""
+"""Relative spacing of float32 numbers."""
 MIN_CENTRE_RATIO, MAX_ASPECT_ERROR = 1.8, 0.25
-"""Least ratio of a principal point to the middle, along both axes alike, that tells of photos of another size."""
+"""Minimum ratio of the principal point to the image centre, about equal on both axes, that indicates another photo size."""
 
 
 def require_keys(where: object, have: Iterable[str], needed: Sequence[str]) -> None:
@@ -36,7 +36,7 @@ def require_keys(where: object, have: Iterable[str], needed: Sequence[str]) -> N
 
 
 def parse_number(where: object, key: str, value: Any) -> float:
-    """A finite real number; text that holds one (some exporters write it so) and arrays of one element count."""
+    """Parses a finite number; accepts strings (as some exporters write) and arrays of one element."""
     array = parse_floats(where, key, value)
     if isinstance(value, bool) or array.size != 1 or not np.isfinite(array).all():
         raise InputError(where, key, f"{value!r} of shape {array.shape}", "one finite number")
@@ -44,7 +44,7 @@ def parse_number(where: object, key: str, value: Any) -> float:
 
 
 def parse_floats(where: object, key: str, value: Any) -> Float[np.ndarray, "..."]:
-    """An array, or nested lists, as float64."""
+    """Parses an array or nested lists as float64."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError) as error:
@@ -52,7 +52,7 @@ def parse_floats(where: object, key: str, value: Any) -> Float[np.ndarray, "..."
 
 
 def parse_array(where: object, key: str, value: Any, *shape: int) -> Float[np.ndarray, "..."]:
-    """Finite numbers of a shape, as float64."""
+    """Parses finite numbers of a shape as float64."""
     array = parse_floats(where, key, value)
     if array.shape != shape or not np.isfinite(array).all():
         found = f"shape {array.shape}" if array.shape != shape else "nan or infinity"
@@ -62,11 +62,11 @@ def parse_array(where: object, key: str, value: Any, *shape: int) -> Float[np.nd
 
 @np.errstate(all="ignore")
 def check_poses(where: object, label: str, value: Any) -> Float[np.ndarray, "V 4 4"]:
-    """Camera-to-world matrices [R t; 0 1], float64, with R a rotation; a uniform scale of R is divided out, and said.
+    """Parses camera-to-world matrices [R t; 0 1] as float64; a uniform scale of R is divided out with a warning.
 
     Args:
         where: the file, for messages.
-        label: names pose i in messages: "c2ws_train[{}]".
+        label: name of pose i in messages: "c2ws_train[{}]".
         value: an array or nested lists.
     """
     expected = "camera-to-world matrices [R t; 0 0 0 1] with R a rotation"
@@ -81,28 +81,28 @@ def check_poses(where: object, label: str, value: Any) -> Float[np.ndarray, "V 4
     problems = {
         "nan or infinity": ~is_finite,
         "another bottom row: is it transposed?": np.abs(poses[:, 3] - [0, 0, 0, 1]).max(1) > RIGID_TOLERANCE,
-        "no rotation (R^T R is not 1), but shear or scale": ~is_orthonormal(poses[:, :3, :3]),
+        "shear or non-uniform scale (R^T R is not 1)": ~is_orthonormal(poses[:, :3, :3]),
         "a mirror (det R = -1): left-handed axes": np.linalg.det(poses[:, :3, :3]) < 0,
         f"a camera farther away than {MAX_COORDINATE:g}": np.abs(poses[:, :3, 3]).max(1) > MAX_COORDINATE,
     }
-    for found, wrong in problems.items():
-        if wrong.any():
-            raise InputError(where, label.format(int(wrong.argmax())), found, expected)
+    for found, is_invalid in problems.items():
+        if is_invalid.any():
+            raise InputError(where, label.format(int(is_invalid.argmax())), found, expected)
     if scaled.any():
-        text = "%s: %d of %d rotations carry a uniform scale, such as %.4g: divided out, camera positions stay"
+        text = "%s: %d of %d rotations have a uniform scale, such as %.4g: divided out, camera positions unchanged"
         log.warning(text, where, scaled.sum(), len(poses), scale[scaled.argmax()])
     return poses
 
 
 def is_orthonormal(matrices: Float[np.ndarray, "V 3 3"]) -> Bool[np.ndarray, "V"]:
-    """Whether R^T R is the identity, for each matrix; false for nan."""
+    """Whether R^T R is the identity, per matrix; False for NaN."""
     error = matrices.swapaxes(-1, -2) @ matrices - np.eye(3)
     return np.abs(error).max((-2, -1)) <= RIGID_TOLERANCE
 
 
 @np.errstate(all="ignore")
 def check_similarity(where: object, key: str, value: Any) -> Float[np.ndarray, "4 4"]:
-    """[s R t; 0 1] with R a rotation and s a positive scale."""
+    """Parses a similarity [s R t; 0 1] with R a rotation and s > 0."""
     matrix = parse_array(where, key, value, 4, 4)
     scale = np.cbrt(np.linalg.det(matrix[:3, :3]))
     is_similarity = (
@@ -112,10 +112,8 @@ def check_similarity(where: object, key: str, value: Any) -> Float[np.ndarray, "
         and np.allclose(matrix[3], [0, 0, 0, 1], atol=RIGID_TOLERANCE)
     )
     if not is_similarity:
-        expected = (
-            f"a similarity [s R t; 0 0 0 1]: a rotation times a scale, and a shift, of at most {MAX_COORDINATE:g}"
-        )
-        raise InputError(where, key, str(matrix.tolist()), expected, "leave it out: the frame is the file's own")
+        expected = f"a similarity [s R t; 0 0 0 1], with scale and translation of at most {MAX_COORDINATE:g}"
+        raise InputError(where, key, str(matrix.tolist()), expected, "or omit it to use the file's frame")
     return matrix
 
 
@@ -125,35 +123,30 @@ def check_split_size(where: object, key: str, count: int) -> None:
 
 
 def check_camera(where: object, key: str, intrinsics: Intrinsics) -> Intrinsics:
-    """The optics, if a camera can have its size, intrinsics and distortion."""
-    o = intrinsics
-    if not (1 <= o.width <= MAX_FOCAL_PX and 1 <= o.height <= MAX_FOCAL_PX):
-        raise InputError(where, key, f"{o.width:g}x{o.height:g} pixels", "the size of a photo")
-    check_intrinsics(where, key, o.K, o.width, o.height)
-    if not o.is_invertible():
-        found = ", ".join(f"{name}={value:g}" for name, value in o.distortion._asdict().items() if value)
-        raise InputError(where, key, f"a distortion that folds the photo over ({found})", "that of a real lens")
+    """Checks size, intrinsics and distortion of a camera."""
+    width, height = intrinsics.width, intrinsics.height
+    if not (1 <= width <= MAX_FOCAL_PX and 1 <= height <= MAX_FOCAL_PX):
+        raise InputError(where, key, f"{width:g}x{height:g} pixels", "the size of a photo")
+    check_intrinsics(where, key, intrinsics.K, width, height)
+    if not intrinsics.is_invertible():
+        found = ", ".join(f"{name}={value:g}" for name, value in intrinsics.distortion._asdict().items() if value)
+        raise InputError(where, key, f"a distortion that is not invertible ({found})", "that of a real lens")
     return intrinsics
 
 
 def check_intrinsics(where: object, key: str, value: Any, width: int, height: int) -> Float[np.ndarray, "3 3"]:
-    """A matrix K in pixels of photos of a size, if directions of their pixels differ in single precision.
-
-    A principal point that is the middle of photos of another size, as far off along both axes, is refused too.
-    """
+    """Parses K, in pixels. Rejects one whose pixels float32 cannot resolve, or that belongs to another photo size."""
     K = parse_array(where, key, value, 3, 3)
     if K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
         raise InputError(where, key, str(K.tolist()), "[[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels")
     least = max(width, height) / MAX_FOCAL_PX
     if not min(K[0, 0], K[1, 1]) >= least or np.abs(K).max() > MAX_FOCAL_PX:
-        expected = f"focal lengths of at least {least:.2g} pixels, none of these numbers above {MAX_FOCAL_PX:.0f}"
+        expected = f"focal lengths of at least {least:.2g} pixels, and no number above {MAX_FOCAL_PX:.0f}"
         raise InputError(where, key, str(K.tolist()), expected, "are they in pixels?")
-    across, down = 2 * K[0, 2] / width, 2 * K[1, 2] / height
-    if min(across, down) > MIN_CENTRE_RATIO and abs(across / down - 1) < MAX_ASPECT_ERROR:
-        found = (
-            f"{K[0, 2]:g}, {K[1, 2]:g}, the middle of photos {across:.3g} times as large as these, of {width}x{height}"
-        )
-        raise InputError(where, key, found, "intrinsics of these photos", "give w and h of the photos they belong to")
+    ratio_x, ratio_y = 2 * K[0, 2] / width, 2 * K[1, 2] / height
+    if min(ratio_x, ratio_y) > MIN_CENTRE_RATIO and abs(ratio_x / ratio_y - 1) < MAX_ASPECT_ERROR:
+        found = f"{K[0, 2]:g}, {K[1, 2]:g}, the middle of photos {ratio_x:.3g} times the size {width}x{height}"
+        raise InputError(where, key, found, "intrinsics of these photos", "give w and h of the calibrated photos")
     return K
 
 
@@ -167,7 +160,7 @@ def check_near_far(where: object, near: float | None, far: float | None) -> None
 
 def check_box(where: object, key: str, value: Any) -> Float[np.ndarray, "2 3"]:
     aabb = parse_array(where, key, value, 2, 3)
-    low, high = aabb.astype(np.float32)  # as it will be used
+    low, high = aabb.astype(np.float32)  # the precision of training
     if np.abs(aabb).max() > MAX_COORDINATE or not (high - low > MIN_CAMERA_DISTANCE).all():
         expected = f"a lower corner below the upper one on each axis, coordinates of at most {MAX_COORDINATE:g}"
         raise InputError(where, key, str(aabb.tolist()), expected)
@@ -175,10 +168,10 @@ def check_box(where: object, key: str, value: Any) -> Float[np.ndarray, "2 3"]:
 
 
 def check_view_size(where: object, key: str, width: object, height: object) -> tuple[int, int]:
-    """Width and height in pixels of views to be rendered, each of which must fit into memory."""
+    """Checks the size in pixels of views to render, each of which must fit into memory."""
     for side in (width, height):
         if not isinstance(side, int) or isinstance(side, bool) or side < 1:
             raise InputError(where, key, repr(side)[:60], "a width and a height, each at least one pixel")
-    assert isinstance(width, int) and isinstance(height, int)  # as was just checked
+    assert isinstance(width, int) and isinstance(height, int)  # for mypy
     check_memory(where, key, f"{width}x{height} pixels", BYTES_PER_RENDERED_PIXEL * width * height)
     return width, height

@@ -1,6 +1,6 @@
-"""COLMAP's files: cameras (https://colmap.github.io/cameras.html), images and points3D, binary or text.
+"""Readers of COLMAP models: cameras (https://colmap.github.io/cameras.html), images and points3D, binary or text.
 
-Read here, because pycolmap ends the process over a damaged file, and is not needed for anything else in training.
+pycolmap is not used, since it aborts the process on damaged files, and training does not need it otherwise.
 """
 
 import struct
@@ -34,16 +34,16 @@ CAMERA_MODELS = {
     "SIMPLE_FISHEYE": (14, "f cx cy"),
     "FISHEYE": (15, "fx fy cx cy"),
 }
-"""Number and parameters of each camera model that is read; `k`, `p`, `d`, `s` as in `cameras.Distortion`."""
+"""Id and parameters of each supported camera model; `k`, `p`, `d`, `s` as in `cameras.Distortion`."""
 CAMERA_MODEL_NAMES = {number: name for name, (number, _) in CAMERA_MODELS.items()}
 Record = tuple[Any, ...]
 MAX_QUATERNION_ERROR = 1e-2
-"""Of a pose's quaternion."""
+"""Largest deviation of a quaternion's norm from 1."""
 
 
 @dataclass(frozen=True)
 class RegisteredImage:
-    """One placed photo."""
+    """One registered photo."""
 
     name: str
     intrinsics: Intrinsics
@@ -52,7 +52,7 @@ class RegisteredImage:
 
 
 def find_model_files(folder: Path) -> list[Path]:
-    """Cameras, images and points of a model, the binary ones where there are both; none without the first two."""
+    """Finds the cameras, images and points files of a model, preferring binary; empty without the first two."""
     for ending in (".bin", ".txt"):
         files = [folder / f"{name}{ending}" for name in MODEL_FILES]
         if files[0].is_file() and files[1].is_file():
@@ -61,10 +61,10 @@ def find_model_files(folder: Path) -> list[Path]:
 
 
 def read_model(folder: Path) -> tuple[list[RegisteredImage], Float[np.ndarray, "P 3"]]:
-    """Reads a sparse model, the binary files where there are both: its photos, and its points, if it has any.
+    """Reads the registered photos and points of a sparse model, preferring binary files.
 
     Raises:
-        InputError: damaged files, no photo, or a camera model that is not known here.
+        InputError: damaged files, no photo, or an unsupported camera model.
     """
     files = find_model_files(folder)
     parsers = BINARY_PARSERS if files[0].suffix == ".bin" else TEXT_PARSERS
@@ -73,7 +73,7 @@ def read_model(folder: Path) -> tuple[list[RegisteredImage], Float[np.ndarray, "
     )
     intrinsics = {number: make_intrinsics(files[0], f"camera {number}", *camera) for number, *camera in cameras}
     if not photos:
-        raise InputError(files[1], "", "0 photos", "at least one placed photo")
+        raise InputError(files[1], "", "0 photos", "at least one registered photo")
     images = []
     for name, camera, pose in photos:
         if camera not in intrinsics:
@@ -97,7 +97,7 @@ def _read_rows(path: Path, parse: Callable[[Path], Iterator[Record]]) -> list[Re
 def make_intrinsics(
     where: object, key: str, model: str, width: int, height: int, parameters: tuple[float, ...]
 ) -> Intrinsics:
-    """A camera in COLMAP's terms."""
+    """Converts a COLMAP camera."""
     names = list_parameters(where, key, model)
     if len(names) != len(parameters):
         raise InputError(where, key, f"{len(parameters)} parameters", f"{len(names)} of {model}: {' '.join(names)}")
@@ -116,7 +116,7 @@ def list_parameters(where: object, key: str, model: str) -> list[str]:
 
 @np.errstate(all="ignore")
 def invert_pose(path: Path, name: str, pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "4 4"]:
-    """Camera to world, from a world-to-camera pose: quaternion (w, x, y, z) and translation."""
+    """Inverts a world-to-camera pose: quaternion (w, x, y, z) and translation."""
     is_unit = abs(np.linalg.norm(pose[:4]) - 1) < MAX_QUATERNION_ERROR
     if not is_unit or not (np.abs(pose[4:]) <= checks.MAX_COORDINATE).all():
         expected = f"a unit quaternion and a translation of at most {checks.MAX_COORDINATE:g}"
@@ -128,19 +128,19 @@ def invert_pose(path: Path, name: str, pose: Float[np.ndarray, "7"]) -> Float[np
 
 
 class BinaryReader:
-    """Reads records of a binary file; struct.error or ValueError where it ends before."""
+    """Reads records of a binary file; struct.error or ValueError if it is truncated."""
 
     def __init__(self, path: Path):
         self.content, self.offset = read_file(path), 0
 
     def read(self, form: str) -> Record:
-        """The next numbers, in struct's notation, little-endian."""
-        found = struct.unpack_from("<" + form, self.content, self.offset)
+        """Reads the next numbers, given in struct's notation, little-endian."""
+        values = struct.unpack_from("<" + form, self.content, self.offset)
         self.offset += struct.calcsize("<" + form)
-        return found
+        return values
 
     def iterate_records(self) -> range:
-        """As many as the next number says."""
+        """Reads a count and iterates over it."""
         return range(self.read("Q")[0])
 
     def skip_records(self, size: int) -> None:
@@ -148,14 +148,14 @@ class BinaryReader:
         self.offset += count * size
 
     def read_text(self) -> str:
-        """A name that ends with a zero byte."""
+        """Reads a zero-terminated string."""
         start, end = self.offset, self.content.index(b"\0", self.offset)
         self.offset = end + 1
         return self.content[start:end].decode()
 
 
 def _parse_binary_cameras(path: Path) -> Iterator[Record]:
-    """Number, model, width, height and parameters of each camera."""
+    """Yields id, model, width, height and parameters of each camera."""
     file = BinaryReader(path)
     for _ in file.iterate_records():
         number, model, width, height = file.read("iiQQ")
@@ -164,7 +164,7 @@ def _parse_binary_cameras(path: Path) -> Iterator[Record]:
 
 
 def _parse_binary_images(path: Path) -> Iterator[Record]:
-    """Name, number of the camera, and quaternion and translation of each photo."""
+    """Yields name, camera id, and quaternion and translation of each photo."""
     file = BinaryReader(path)
     for _ in file.iterate_records():
         _, *pose, camera = file.read("i7di")
@@ -176,11 +176,11 @@ def _parse_binary_points(path: Path) -> Iterator[Record]:
     file = BinaryReader(path)
     for _ in file.iterate_records():
         yield file.read("Q3d3Bd")[1:4]
-        file.skip_records(8)  # the images that see it
+        file.skip_records(8)  # the track
 
 
 def _split_lines(path: Path) -> Iterator[str]:
-    """All lines but comments, empty ones too."""
+    """Iterates over the lines without comments; keeps empty lines."""
     return (line for line in read_file(path).decode().splitlines() if not line.startswith("#"))
 
 

@@ -1,4 +1,4 @@
-"""Resolves the file names that scene files contain to the files on this disk."""
+"""Resolves file names in scene files to files on disk."""
 
 import logging
 import os
@@ -16,31 +16,31 @@ log = logging.getLogger(__name__)
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif")
 MASK_FOLDERS = ("masks", "mask", "images_mask", "images_masks")
 NON_PHOTO_FOLDERS = re.compile(r"(masks?|images_masks?|depths?|depth_maps|normals?|semantics?|.*_\d+)$", re.IGNORECASE)
-"""Folders whose files have the photos' names and are not the photos: masks, depth maps, reduced copies such as images_4."""
+"""Folders whose files share the photos' names: masks, depth maps, reduced copies such as images_4."""
 MAX_FILES = 200_000
-"""Most files that are listed in search of a moved one."""
+"""Files listed at most when searching for a moved one."""
 MAX_SHOWN = 4
 """Names in a message."""
 
 
 def is_image(name: str) -> bool:
-    """By its extension; hidden files, as macOS's `._a.jpg`, are none."""
+    """Whether the extension is an image's; False for hidden files, such as macOS's `._a.jpg`."""
     return PurePosixPath(name).suffix.lower() in IMAGE_SUFFIXES and not name.startswith(".")
 
 
 def make_natural_key(name: str) -> list[tuple[int, int, str]]:
-    """A key that sorts photo 9 before photo 10."""
+    """Sort key that puts photo 9 before photo 10."""
     parts = filter(None, re.split(r"(\d+)", name.lower()))
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def list_images(folder: Path) -> list[Path]:
-    """The image files of a folder, sorted by name."""
+    """Lists the image files of a folder, sorted by name."""
     return sorted(file for file in folder.iterdir() if is_image(file.name) and file.is_file())
 
 
 def walk_images(root: Path) -> Iterator[Path]:
-    """All image files below a folder, hidden ones and hidden folders left out."""
+    """Iterates over all image files below a folder, except hidden files and folders."""
     count = 0
     for folder, folders, files in os.walk(root):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
@@ -51,8 +51,7 @@ def walk_images(root: Path) -> Iterator[Path]:
 
 
 def normalize_name(name: str) -> tuple[str, ...]:
-    """The parts of a path as any system writes it, without drive, root and `.` parts, under Unicode (NFC) and case folding;
-    the last without an image's extension."""
+    """Splits a path of any system into parts, NFC-normalized and case-folded, without drive, root, `.` and image extension."""
     name = unicodedata.normalize("NFC", unicodedata.normalize("NFC", name).casefold()).replace("\\", "/")
     parts = tuple(part for part in PurePosixPath(name).parts if part not in ("/", "//") and not part.endswith(":"))
     if parts and (suffix := PurePosixPath(parts[-1]).suffix) in IMAGE_SUFFIXES:
@@ -61,35 +60,35 @@ def normalize_name(name: str) -> tuple[str, ...]:
 
 
 def find_exact_file(root: Path, name: str) -> Path | None:
-    """The file at a path relative to a folder, whose extension may be missing, as Blender exports leave it."""
+    """Finds the file at a relative path, whose extension may be missing, as in Blender exports."""
     suffixes = ("", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES))
     return next((file for suffix in suffixes if os.path.isfile(file := root / (name + suffix))), None)
 
 
 def find_images(root: Path, names: Sequence[str], where: object) -> list[Path | None]:
-    """The image files that a scene file names; None where there is none.
+    """Finds the image files named in a scene file; None for missing ones.
 
-    A name means the file at that path relative to `root`; or else the one file below `root`, meant by no other name, whose
-    base name, and as many of its folders as possible, are the same under `normalize_name`. Reduced copies, masks and depth maps
-    count only where nothing else has the name. A line says which names were substituted.
+    A name refers to the file at that path relative to `root`; or else to the file below `root` with the same base name, and
+    the most matching parent folders, under `normalize_name`. Reduced copies, masks and depth maps match only if nothing else
+    does. Substitutions are logged.
 
     Args:
         root: folder that names are relative to.
-        names: as the file has them.
+        names: as in the file.
         where: the file, for messages.
 
     Raises:
-        InputError: several files may be meant, or one by two names.
+        InputError: a name matches several files, or two names one file.
     """
     found = {name: find_exact_file(root, name) for name in names}
     inexact = [name for name, file in found.items() if file is None]
-    exact, free = set(found.values()), dict[str, list[Path]]()
+    exact, unclaimed = set(found.values()), dict[str, list[Path]]()
     for file in walk_images(root) if inexact else ():
         if file not in exact:
-            free.setdefault(normalize_name(file.name)[-1], []).append(file)
+            unclaimed.setdefault(normalize_name(file.name)[-1], []).append(file)
     claims: dict[Path, list[tuple[int, str]]] = {}
     for name in inexact:
-        if (closest := _find_closest(root, name, free, where)) is not None:
+        if (closest := _find_closest(root, name, unclaimed, where)) is not None:
             file, length = closest
             claims.setdefault(file, []).append((length, name))
     moved = []
@@ -103,18 +102,18 @@ def find_images(root: Path, names: Sequence[str], where: object) -> list[Path | 
         if PurePosixPath(name.replace("\\", "/")) not in (inside, inside.with_suffix("")):
             moved.append((inside.as_posix(), name))
     if moved:
-        text = "%s: %d names are not those of the files on disk; taken by their base names, such as %s for %r"
+        text = "%s: %d names do not match files on disk; matched by base name, such as %s for %r"
         log.warning(text, where, len(moved), *moved[0])
     return [found[name] for name in names]
 
 
-def _find_closest(root: Path, name: str, free: Mapping[str, list[Path]], where: object) -> tuple[Path, int] | None:
-    """The file whose folded path shares most parts with a name, from the last on, and how many."""
-    wanted = normalize_name(name)
+def _find_closest(root: Path, name: str, unclaimed: Mapping[str, list[Path]], where: object) -> tuple[Path, int] | None:
+    """Finds the file whose normalized path shares most trailing parts with a name, and their number."""
+    target = normalize_name(name)
     ranks = {}
-    for file in free.get(wanted[-1], []) if wanted else []:
-        own = normalize_name(str(inside := file.relative_to(root)))
-        shared = len(os.path.commonprefix([wanted[::-1], own[::-1]]))
+    for file in unclaimed.get(target[-1], []) if target else []:
+        parts = normalize_name(str(inside := file.relative_to(root)))
+        shared = len(os.path.commonprefix([target[::-1], parts[::-1]]))
         is_photo = not any(map(NON_PHOTO_FOLDERS.match, inside.parts[:-1]))
         ranks[file] = (shared, is_photo, file.suffix.lower() == PurePosixPath(name).suffix.lower())
     best = [file for file, rank in ranks.items() if rank == max(ranks.values())]
@@ -134,12 +133,12 @@ Photo = TypeVar("Photo", bound=HasName)
 
 
 def drop_missing(where: object, photos: Sequence[Photo], files: Sequence[Path | None]) -> list[tuple[Photo, Path]]:
-    """The photos whose file is there, and it. A line names the others; InputError if those are the majority."""
+    """Drops photos without a file, with a warning; raises InputError if they are the majority."""
     missing = sorted(photo.name for photo, file in zip(photos, files, strict=True) if file is None)
     if 2 * len(missing) > len(photos):
         found = f"no file for {missing[0]!r} and {len(missing) - 1} more of {len(photos)} photos"
         raise InputError(where, "", found, hint="is the folder of photos in place?")
     if missing:
         shown = join_truncated(missing, MAX_SHOWN)
-        log.warning("%s: %d of %d photos are not there, %s: left out", where, len(missing), len(photos), shown)
+        log.warning("%s: ignoring %d of %d photos without a file: %s", where, len(missing), len(photos), shown)
     return [(photo, file) for photo, file in zip(photos, files, strict=True) if file is not None]

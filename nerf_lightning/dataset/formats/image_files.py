@@ -1,4 +1,4 @@
-"""Image files: size, alpha and EXIF tags, and pixels of any depth and channel count as 8-bit RGB or RGBA."""
+"""Reads image files: headers with size, alpha and EXIF tags, and pixels as 8-bit RGB or RGBA."""
 
 import math
 import struct
@@ -22,17 +22,17 @@ from nerf_lightning.utils.parsing import require_file
 
 MAX_DECODE_THREADS = 4
 MAX_HEADERS = 4096
-"""Files whose headers are kept in memory."""
+"""Headers cached in memory."""
 DRAFT_SCALES = (8, 4, 2)
-"""Factors by which libjpeg reduces while it decodes."""
+"""Downscaling factors of libjpeg's decoder."""
 MIN_OVERSAMPLING = 2
-"""Least ratio of a reduced JPEG's sides to those it is averaged to, where they differ: its low-pass filter is sharper than
-an average, and shows only where little is averaged afterwards (43 dB against the average of the whole photo, else above 50)."""
+"""Minimum oversampling of a JPEG draft that is averaged further: libjpeg's filter is sharper than area averaging, which is
+visible only if little is averaged afterwards (43 dB against averaging the full photo, otherwise above 50)."""
 JPEG_MAGIC = b"\xff\xd8"
 HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
-"""Brands after `ftyp` in photos of phones (ISO 23008-12); the last two stand for any codec."""
+"""Brands after `ftyp` in phone photos (ISO 23008-12); the last two allow any codec."""
 ORIENTATION_TAG, EXIF_IFD_TAG, EXPOSURE_TAG, APERTURE_TAG, ISO_TAG = 0x0112, 0x8769, 0x829A, 0x829D, 0x8827
-"""Numbers of EXIF tags: how the camera was held, those about how a photo was taken, seconds, f-number and ISO speed."""
+"""EXIF tag ids: orientation, Exif IFD, exposure time in seconds, f-number and ISO speed."""
 ORIENTATION_TRANSPOSES = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -42,34 +42,34 @@ ORIENTATION_TRANSPOSES = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-"""What brings a photo of an EXIF orientation upright."""
+"""Transpose that makes a photo of each EXIF orientation upright."""
 SIDEWAYS_ORIENTATIONS = (5, 6, 7, 8)
-"""Orientations of photos that lie on their side."""
+"""Orientations rotated by 90 degrees."""
 DECODE_ERRORS = (OSError, ValueError, SyntaxError, KeyError, TypeError, OverflowError, ZeroDivisionError, struct.error)
-"""What Pillow raises for broken tags or pixels, or for a picture of a kind that it does not know."""
+"""Errors that Pillow raises for broken tags or pixels, or unsupported kinds of image."""
 FORMATS = "a whole PNG, JPEG, TIFF, WebP or HEIC image of 8 or 16 bits a channel"
 
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What one image file says before its pixels."""
+    """Header of one image file."""
 
     width: int
     """As stored, in pixels."""
     height: int
     alpha: bool
     orientation: int
-    """As EXIF says; 1 for upright as stored, and with alpha."""
+    """EXIF orientation; 1 (upright) with alpha."""
     tags: Mapping[int, Any]
-    """EXIF tags by their numbers, but for those of raw bytes, as makers' notes; none where there are none, or broken ones."""
+    """EXIF tags by id, without raw bytes (maker notes); empty if missing or broken."""
 
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """An image file, not decoded yet.
+    """Opens an image file without decoding it.
 
     Raises:
-        InputError: it is none that Pillow reads, is damaged, or is HEIC without the package that reads it; in the block too.
+        InputError: unsupported, damaged, or HEIC without pillow_heif; also for errors inside the block.
     """
     with require_file(path).open("rb") as file:
         start = file.read(12)
@@ -91,7 +91,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def read_header(path: Path) -> ImageHeader:
-    """The header of an image file.
+    """Reads the header of an image file (cached).
 
     Raises:
         InputError: see `open_image`.
@@ -102,9 +102,9 @@ def read_header(path: Path) -> ImageHeader:
 
 @lru_cache(maxsize=MAX_HEADERS)
 def _read_header(path: Path, size: int, mtime_ns: int) -> ImageHeader:
-    """The other arguments tell versions of a file apart."""
+    """Size and time are part of the cache key, so that changed files are read again."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of sizes: nothing is decoded here; and on tags that nothing asks for
+        warnings.simplefilter("ignore")  # about large sizes (nothing is decoded here) and unused tags
         with open_image(path) as image:
             alpha, tags = image.has_transparency_data, _read_tags(image)
             orientation = 1 if alpha else tags.get(ORIENTATION_TAG, 1)
@@ -121,7 +121,7 @@ def _read_tags(image: Image.Image) -> dict[int, Any]:
 
 
 def read_image_size(path: Path, upright: bool = False) -> tuple[int, int, bool]:
-    """Width, height, and whether there is alpha.
+    """Reads width, height, and whether there is alpha.
 
     Args:
         path, upright: see `read_pixels`.
@@ -136,43 +136,43 @@ def read_image_size(path: Path, upright: bool = False) -> tuple[int, int, bool]:
 
 
 def read_exposure(path: Path) -> float | None:
-    """Light that a photo gathered, by its tags: seconds times ISO speed over the squared f-number; None if they do not say."""
+    """Computes the exposure from EXIF: seconds x ISO speed / f-number^2; None if tags are missing."""
     tags = read_header(path).tags
     try:
         speed = tags[ISO_TAG]
-        first = speed[0] if isinstance(speed, tuple) else speed  # of two kinds of sensitivity
-        found = float(tags[EXPOSURE_TAG]) * float(first) / float(tags[APERTURE_TAG]) ** 2
+        iso = speed[0] if isinstance(speed, tuple) else speed  # the tag may have two kinds of sensitivity
+        exposure = float(tags[EXPOSURE_TAG]) * float(iso) / float(tags[APERTURE_TAG]) ** 2
     except (*DECODE_ERRORS, IndexError):
         return None
-    return found if 0 < found < math.inf else None
+    return exposure if 0 < exposure < math.inf else None
 
 
 def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "H W C"]:
     """Decodes one image: RGB, or RGBA with straight alpha; 16 bits become 8, grey becomes RGB.
 
     Args:
-        path: PNG, JPEG, TIFF or whatever else Pillow reads, or HEIC.
+        path: PNG, JPEG, TIFF, another format of Pillow, or HEIC.
         upright: apply the EXIF rotation (not to images with alpha). Off for posed photos, whose poses and intrinsics
-            are about the pixels as stored. HEIC photos are upright always: the rotation is part of their format.
-        size: width and height that the caller averages it to. A JPEG is then decoded at 1/2, 1/4 or 1/8 of its size where
+            refer to the stored pixels. HEIC photos are always upright: the rotation is part of the format.
+        size: width and height to which the caller averages. JPEGs are then decoded at 1/2, 1/4 or 1/8 of their size if
             that is exact and leaves enough pixels.
 
     Raises:
-        InputError: missing, truncated, not an image, or of floating-point pixels; HEIC without the package that reads it.
+        InputError: missing, truncated, not an image, floating-point pixels, or HEIC without pillow_heif.
     """
     header = read_header(path)
     orientation = header.orientation if upright else 1
-    wanted = size[::-1] if size is not None and orientation in SIDEWAYS_ORIENTATIONS else size
+    target = size[::-1] if size is not None and orientation in SIDEWAYS_ORIENTATIONS else size
     with open_image(path) as image:
-        image.verify()  # checksums of a PNG, which decoding does not look at
+        image.verify()  # PNG checksums, which decoding ignores
     with open_image(path) as image:
         factor = 1
-        if wanted is not None and isinstance(image, JpegImageFile):
-            factor = choose_draft_scale(header.width, header.height, wanted)
+        if target is not None and isinstance(image, JpegImageFile):
+            factor = choose_draft_scale(header.width, header.height, target)
         check_memory(path, "", f"{header.width}x{header.height} pixels", 4 * header.width * header.height // factor**2)
         image.draft(image.mode, (header.width // factor, header.height // factor))
         if image.mode in ("I", "F"):
-            raise InputError(path, "", "pixels of 32 bits", FORMATS, "convert it")
+            raise InputError(path, "", "32-bit pixels", FORMATS, "convert it")
         if image.mode.startswith("I;16"):
             image = Image.fromarray(((np.asarray(image, np.uint32) + 128) // 257).astype(np.uint8))
         if image.mode != (mode := "RGBA" if header.alpha else "RGB"):
@@ -180,13 +180,13 @@ def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None 
         return np.array(image if orientation == 1 else image.transpose(ORIENTATION_TRANSPOSES[orientation]))
 
 
-def choose_draft_scale(width: int, height: int, wanted: tuple[int, int]) -> int:
-    """The largest factor by which libjpeg may reduce a photo that is averaged to `wanted` pixels afterwards."""
+def choose_draft_scale(width: int, height: int, target: tuple[int, int]) -> int:
+    """Chooses the largest libjpeg downscaling factor for a photo that is averaged to `target` pixels afterwards."""
     for factor in DRAFT_SCALES:
         reduced = width // factor, height // factor
         exact = (width % factor, height % factor) == (0, 0)
         if exact and (
-            reduced == wanted or all(a >= MIN_OVERSAMPLING * b for a, b in zip(reduced, wanted, strict=True))
+            reduced == target or all(a >= MIN_OVERSAMPLING * b for a, b in zip(reduced, target, strict=True))
         ):
             return factor
     return 1

@@ -1,4 +1,4 @@
-"""The LLFF format (Mildenhall et al. 2019): poses_bounds.npy beside a folder of photos."""
+"""LLFF format (Mildenhall et al. 2019): poses_bounds.npy and a folder of photos."""
 
 from pathlib import Path
 
@@ -20,18 +20,18 @@ PHOTO_FOLDERS = ("images", "images_2", "images_4", "images_8", "")
 
 
 def load_llff(folder: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
-    """Reads poses_bounds.npy and the photos beside it, in the order of their names.
+    """Reads poses_bounds.npy and its photos, sorted by name.
 
-    A row holds a pose of 3 x 5 numbers (rotation with columns down, right, backward; centre; height, width and focal length in
+    A row has a pose of 3 x 5 numbers (rotation with columns down, right, backward; centre; height, width and focal length in
     pixels), then the nearest and farthest depth.
 
     Args:
-        folder: holds poses_bounds.npy and `images`, or photos of another size in `images_2`, `images_4` or `images_8`.
+        folder: folder of poses_bounds.npy and `images`, or of reduced photos in `images_2`, `images_4` or `images_8`.
         name: defaults to the folder's name.
-        options: see there.
+        options: how to read photos.
 
     Raises:
-        InputError: a damaged file, or as many photos as poses are not there.
+        InputError: a damaged file, or different numbers of photos and poses.
     """
     path = folder / POSES_FILE
     rows = checks.parse_floats(path, "", read_npy(path))
@@ -47,21 +47,20 @@ def load_llff(folder: Path, name: str | None = None, options: PhotoLoadOptions =
         width, height, focal = checks.parse_array(path, photo.name, [width, height, focal], 3).tolist()
         intrinsics = Intrinsics(round(width), round(height), focal, focal, width / 2, height / 2)
         cameras.append(checks.check_camera(path, photo.name, intrinsics))
-    turned = choose_orientations(folder, photos, [(one.width, one.height) for one in cameras], options.orientation)
-    parts = zip(photos, c2w, cameras, find_masks(photos, folder), turned, strict=True)
-    shots = [PosedPhoto(photo.name, photo, *rest) for photo, *rest in parts]
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    upright = choose_orientations(folder, photos, sizes, options.orientation)
+    parts = zip(photos, c2w, cameras, find_masks(photos, folder), upright, strict=True)
+    posed_photos = [PosedPhoto(photo.name, photo, *rest) for photo, *rest in parts]
     nearest = float(rows[:, 15].min())
     hints = Hints(nearest_depth=nearest if 0 < nearest <= checks.MAX_COORDINATE else None)
-    return build_scene(folder, name or folder.resolve().name, shots, options, hints=hints)
+    return build_scene(folder, name or folder.resolve().name, posed_photos, options, hints=hints)
 
 
 def find_llff_photos(folder: Path, count: int) -> list[Path]:
-    """As many photos as there are poses, in the order of their names."""
+    """Finds the photo folder with camera photo per pose, sorted by name."""
     found = {name or ".": list_images(folder / name) for name in PHOTO_FOLDERS if (folder / name).is_dir()}
     for files in found.values():
         if len(files) == count:
             return files
     shown = ", ".join(f"{len(files)} in {name}" for name, files in found.items() if files) or "no photos"
-    raise InputError(
-        folder / POSES_FILE, "", f"{count} poses, but {shown}", "a pose for each photo of the folder images"
-    )
+    raise InputError(folder / POSES_FILE, "", f"{count} poses, but {shown}", "one pose per photo of the folder images")

@@ -1,4 +1,4 @@
-"""The course format: one .npz file with images, OpenCV camera-to-world poses and a focal length."""
+"""Course format: one .npz file with images, OpenCV camera-to-world poses and a focal length."""
 
 import logging
 import math
@@ -27,26 +27,25 @@ log = logging.getLogger(__name__)
 
 REQUIRED_KEYS = ("images_train", "c2ws_train")
 POSE_KEYS = {"images_train": "c2ws_train", "images_val": "c2ws_val", "images_test": "c2ws_test"}
-"""Images of each split, and their poses."""
+"""Image key of each split -> its pose key."""
 OPTIONAL_KEYS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
 
 
 def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
-    """Reads the course format. Poses are OpenCV camera to world already: nothing is converted.
+    """Reads the course format. Poses are OpenCV camera to world: nothing is converted.
 
     Entries, with V views a split:
         images_train, images_val, images_test: (V, H, W, 3 or 4), uint8 or floats in [0, 1]; without val, test is held out, or
             every `options.holdout`-th of train.
-        c2ws_train, c2ws_val, c2ws_test: (V, 4, 4); the last without images is the orbit, made up like the training cameras if
-            absent.
-        focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which then rules.
+        c2ws_train, c2ws_val, c2ws_test: (V, 4, 4); the last without images is the orbit, generated if absent.
+        focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which takes precedence.
         near, far: distances along the rays, and aabb: (2, 3), world units, with unbounded: whether content lies outside aabb
-            too; without aabb the photos decide, see `classify_scene`.
-        background: (3,), sRGB; if absent the one colour along the photos' borders, or black.
-        to_source: (4, 4), similarity to the frame of the original, identity if absent.
+            too; without aabb the photos are classified, see `classify_scene`.
+        background: (3,), sRGB; defaults to the uniform border colour of the photos, or black.
+        to_source: (4, 4), similarity to the frame of the source; defaults to the identity.
 
     Raises:
-        InputError: anything missing, malformed or contradictory.
+        InputError: an entry is missing, malformed or contradictory.
     """
     data = read_npz(path, (*POSE_KEYS, *POSE_KEYS.values(), *OPTIONAL_KEYS))
     checks.require_keys(path, data, REQUIRED_KEYS)
@@ -65,7 +64,7 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = DE
 
     train, *held_out = (make_views(key, stack) for key, stack in images.items())
     if not held_out:
-        log.warning("%s: no held-out photos: every %d-th training photo is held out", path, options.holdout)
+        log.warning("%s: no held-out photos: holding out every %d-th training photo", path, options.holdout)
         split = split_photos(path, len(train), options.holdout)
         train, val = (train[torch.tensor(part)] for part in (split.train, split.val))
         held_out = [val]
@@ -86,15 +85,15 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = DE
 
 
 def read_images(path: Path, key: str, data: Mapping[str, np.ndarray]) -> UInt8[np.ndarray, "V H W C"]:
-    """The images of a split as uint8; floats in [0, 1] are scaled and rounded."""
-    images, one = data[key], data["images_train"].shape[1:]
+    """Reads the images of a split as uint8; floats in [0, 1] are scaled and rounded."""
+    images, shape = data[key], data["images_train"].shape[1:]
     checks.require_keys(path, data, [POSE_KEYS[key]])
     if images.ndim != 4 or images.shape[3] not in (3, 4) or (images.dtype != np.uint8 and images.dtype.kind != "f"):
         expected = "images of shape (V, H, W, 3 or 4), uint8 or floats in [0, 1]"
         raise InputError(path, key, f"shape {images.shape}, {images.dtype}", expected)
     checks.check_split_size(path, key, images.size)
-    if images.shape[1:] != one:
-        raise InputError(path, key, f"shape {images.shape}", f"images of shape {one}, as in images_train")
+    if images.shape[1:] != shape:
+        raise InputError(path, key, f"shape {images.shape}", f"images of shape {shape}, as in images_train")
     if (poses := data[POSE_KEYS[key]].shape[:1]) != images.shape[:1]:
         raise InputError(path, key, f"{len(images)} images for {math.prod(poses)} poses", "one pose for each image")
     if images.dtype == np.uint8:
@@ -105,7 +104,7 @@ def read_images(path: Path, key: str, data: Mapping[str, np.ndarray]) -> UInt8[n
 
 
 def read_intrinsics(path: Path, data: Mapping[str, np.ndarray], width: int, height: int) -> Float[Tensor, "3 3"]:
-    """Of all views, pixels."""
+    """Reads K of all views, in pixels."""
     key, K = "K", data.get("K")
     if K is None:
         checks.require_keys(path, data, ["focal"])
@@ -114,26 +113,26 @@ def read_intrinsics(path: Path, data: Mapping[str, np.ndarray], width: int, heig
     return torch.from_numpy(checks.check_intrinsics(path, key, K, width, height)).float()
 
 
-def read_background(path: Path, colour: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
-    """sRGB in [0, 1]."""
-    red, green, blue = checks.parse_array(path, "background", colour, 3).tolist()
+def read_background(path: Path, color: Shaped[np.ndarray, "..."]) -> tuple[float, float, float]:
+    """Reads sRGB in [0, 1]."""
+    red, green, blue = checks.parse_array(path, "background", color, 3).tolist()
     if min(red, green, blue) < 0 or max(red, green, blue) > 1:
         raise InputError(path, "background", str([red, green, blue]), "three numbers from 0 to 1")
     return red, green, blue
 
 
 def read_bounds(path: Path, data: Mapping[str, np.ndarray], options: PhotoLoadOptions) -> Bounds:
-    """The box that a file states."""
+    """Reads the box of a file."""
     aabb = torch.from_numpy(checks.check_box(path, "aabb", data["aabb"])).float()
     unbounded = bool(checks.parse_number(path, "unbounded", data.get("unbounded", 0)))
     return Bounds(aabb, unbounded if options.bounded == "auto" else options.bounded == "false")
 
 
 def save_npz(scene: Scene, path: Path) -> None:
-    """Writes the course format, so that `load_npz` gives the same scene back; whole or not at all.
+    """Writes the course format atomically; `load_npz` restores the same scene.
 
     Raises:
-        InputError: the views do not share one K, or the folder cannot be written.
+        InputError: the views do not share one K, or the folder is not writable.
     """
     K = scene.train.cameras.K[0]
     for cameras in (scene.train.cameras, scene.val.cameras, scene.orbit):

@@ -1,4 +1,4 @@
-"""Posed photos in JSON: transforms.json of nerfstudio and instant-ngp, transforms_{train,val,test}.json of the NeRF paper."""
+"""JSON scenes: transforms.json (nerfstudio, instant-ngp) and transforms_{train,val,test}.json (Blender, NeRF paper)."""
 
 import logging
 from collections.abc import Mapping, Sequence
@@ -28,16 +28,16 @@ WHITE = (1.0, 1.0, 1.0)
 def load_transforms(path: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
     """Reads transforms.json: OpenGL camera-to-world poses, converted to OpenCV here.
 
-    Frames whose photo is not there are left out with a warning, as instant-ngp does (its own fox is shipped so), unless
-    they are the majority: then the path is wrong. A frame's `mask_path` is its mask; without any, see `find_masks`.
+    Frames without a photo are ignored with a warning, as in instant-ngp (whose fox has some), unless they are the majority:
+    then the path is wrong. A frame's `mask_path` is its mask; without any, see `find_masks`.
 
     Args:
-        path: transforms.json or the folder that holds it.
+        path: transforms.json or its folder.
         name: defaults to the folder's name, or the file's if that is not transforms.json.
-        options: see there; frames are sorted by file_path, and the file may name its own split.
+        options: how to read photos; frames are sorted by file_path, and the file may define the split.
 
     Raises:
-        InputError: anything missing or malformed, or a lens that is not known here.
+        InputError: missing or malformed entries, or an unsupported lens.
     """
     file = path / "transforms.json" if path.is_dir() else path
     frames = sorted(read_frames(file), key=lambda frame: frame.name)
@@ -45,24 +45,25 @@ def load_transforms(path: Path, name: str | None = None, options: PhotoLoadOptio
     photos = drop_missing(file, frames, find_images(file.parent, names, file))
     split = read_split(file, frames[0].values, names, [frame.name for frame, _ in photos])
     folder = file.resolve().parent
-    shots = make_posed_photos(file, photos, folder, options)
-    return build_scene(path, name or (folder.name if file.stem == "transforms" else file.stem), shots, options, split)
+    posed_photos = make_posed_photos(file, photos, folder, options)
+    name = name or (folder.name if file.stem == "transforms" else file.stem)
+    return build_scene(path, name, posed_photos, options, split)
 
 
 def load_blender(folder: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
-    """Reads transforms_train.json, transforms_val.json and transforms_test.json, as the NeRF paper's renders have them.
+    """Reads transforms_train.json, transforms_val.json and transforms_test.json, the NeRF paper's Blender format.
 
-    Every key of transforms.json counts. Held out is the val split, or test where val has no photos; with both, test is
-    measured on at the end. A split whose photos are not there is a camera path; where no photos are held out, every
-    `options.holdout`-th of the train split is. Photos with alpha stand on white, the format's convention.
+    Every key of transforms.json is supported. The val split is held out, or test if val has no photos; with both, test is
+    evaluated at the end. A split without photos is a camera path; if none is held out, every `options.holdout`-th photo of
+    the train split is. The background of photos with alpha is white, the format's convention.
 
     Args:
-        folder: holds transforms_train.json.
+        folder: folder of transforms_train.json.
         name: defaults to the folder's name.
-        options: see there.
+        options: how to read photos.
 
     Raises:
-        InputError: anything missing or malformed.
+        InputError: missing or malformed entries.
     """
     splits = {"train": read_frames(folder / "transforms_train.json")}
     for split in ("val", "test"):
@@ -76,68 +77,69 @@ def load_blender(folder: Path, name: str | None = None, options: PhotoLoadOption
     for split, frames in splits.items():
         files = [found[frame.name] for frame in frames]
         if split != "train" and not any(files):
-            log.warning("%s: none of its %d photos is there: taken as a camera path", split, len(frames))
+            log.warning("%s: %d frames without photos, used as a camera path", split, len(frames))
             path = frames
             continue
         present = drop_missing(folder / f"transforms_{split}.json", frames, files)
         parts.append(list(range(len(photos), len(photos) + len(present))))
         photos += present
-    shots = make_posed_photos(folder, photos, folder, options)
+    posed_photos = make_posed_photos(folder, photos, folder, options)
     if len(parts) == 1:
-        log.warning("%s: no held-out photos: every %d-th training photo is held out", folder, options.holdout)
-    parted = Split(*parts) if parts[1:] else None
-    hints = Hints(WHITE, keep_frame=True, camera_path=make_camera_path(path, shots[0].intrinsics) if path else None)
-    return build_scene(folder, name or folder.resolve().name, shots, options, parted, hints)
+        log.warning("%s: no held-out photos: holding out every %d-th training photo", folder, options.holdout)
+    indices = Split(*parts) if parts[1:] else None
+    camera_path = make_camera_path(path, posed_photos[0].intrinsics) if path else None
+    hints = Hints(WHITE, keep_frame=True, camera_path=camera_path)
+    return build_scene(folder, name or folder.resolve().name, posed_photos, options, indices, hints)
 
 
 def read_split(file: Path, content: Mapping[str, Any], names: Sequence[str], present: Sequence[str]) -> Split | None:
-    """The split that a file names; None where it names none.
+    """Reads the split defined in a file; None without one.
 
     Args:
-        file: for messages.
-        content: what it says.
-        names: of all its frames.
-        present: those with a photo.
+        file: the file, for messages.
+        content: entries of the file.
+        names: names of all frames.
+        present: names of the frames with a photo.
 
     Raises:
-        InputError: names that are no frame's, or photos in two parts of it.
+        InputError: a name without a frame, or a photo in two splits.
     """
     known, named = {normalize_name(name) for name in names}, dict[str, list[int]]()
     for part in ("train", "val", "test"):
-        given = content.get(key := f"{part}_filenames") or []
-        if not isinstance(given, list) or not all(isinstance(item, str) for item in given):
-            raise InputError(file, key, repr(given)[:60], "a list of file_path strings")
-        if strangers := [item for item in given if normalize_name(item) not in known]:
-            raise InputError(file, key, f"{strangers[0]!r}, which is no frame", "the file_path of a frame")
-        if wanted := {normalize_name(item) for item in given}:
-            named[part] = [i for i, name in enumerate(present) if normalize_name(name) in wanted]
+        listed = content.get(key := f"{part}_filenames") or []
+        if not isinstance(listed, list) or not all(isinstance(item, str) for item in listed):
+            raise InputError(file, key, repr(listed)[:60], "a list of file_path strings")
+        if unknown := [item for item in listed if normalize_name(item) not in known]:
+            raise InputError(file, key, f"{unknown[0]!r}, which is not a frame", "the file_path of a frame")
+        if members := {normalize_name(item) for item in listed}:
+            named[part] = [i for i, name in enumerate(present) if normalize_name(name) in members]
     if not named:
         return None
     rest = sorted(set(range(len(present))).difference(*named.values()))
     train = named.get("train", rest)
     val, *test = [named[part] for part in ("val", "test") if named.get(part)] or [rest]
     if both := set(train) & {*val, *(i for part in test for i in part)}:
-        twice = f"{present[min(both)]!r}, which is in train_filenames too"
-        raise InputError(file, "val_filenames, test_filenames", twice, "held-out photos of their own")
+        duplicate = f"{present[min(both)]!r}, which is also in train_filenames"
+        raise InputError(file, "val_filenames, test_filenames", duplicate, "photos that are not trained on")
     return Split(train, val, *(part for part in test if part != val))
 
 
 def make_posed_photos(
     source: Path, photos: Sequence[tuple[Frame, Path]], folder: Path, options: PhotoLoadOptions
 ) -> list[PosedPhoto]:
-    """Posed photos with their intrinsics and masks."""
-    stated = [read_size(frame) for frame, _ in photos]
-    turned = choose_orientations(source, [file for _, file in photos], stated, options.orientation)
+    """Builds posed photos with intrinsics and masks."""
+    sizes = [read_size(frame) for frame, _ in photos]
+    orientations = choose_orientations(source, [file for _, file in photos], sizes, options.orientation)
     masks = read_masks(source, photos, folder)
-    shots = []
-    for (frame, file), size, upright, mask in zip(photos, stated, turned, masks, strict=True):
+    posed_photos = []
+    for (frame, file), size, upright, mask in zip(photos, sizes, orientations, masks, strict=True):
         intrinsics = read_intrinsics(frame, *(size or read_image_size(file, upright)[:2]))
-        shots.append(PosedPhoto(frame.name, file, frame.c2w, intrinsics, mask, upright))
-    return shots
+        posed_photos.append(PosedPhoto(frame.name, file, frame.c2w, intrinsics, mask, upright))
+    return posed_photos
 
 
 def read_masks(source: Path, photos: Sequence[tuple[Frame, Path]], folder: Path) -> list[Path | None]:
-    """The masks that frames name, or else those found beside the photos."""
+    """Finds the masks named by the frames, or else by `find_masks`."""
     names = [frame.values.get("mask_path") for frame, _ in photos]
     if not any(names):
         return find_masks([file for _, file in photos], folder)
@@ -151,7 +153,7 @@ def read_masks(source: Path, photos: Sequence[tuple[Frame, Path]], folder: Path)
 
 
 def make_camera_path(frames: Sequence[Frame], intrinsics: Intrinsics) -> Cameras:
-    """Pinhole cameras along the poses of frames without photos, with the intrinsics of a photo."""
+    """Builds pinhole cameras at the poses of frames without photos, with a photo's intrinsics."""
     c2w = torch.from_numpy(np.stack([frame.c2w for frame in frames]))
     K = torch.from_numpy(intrinsics.K).repeat(len(frames), 1, 1)
     return Cameras.pinhole(K.float(), c2w, intrinsics.width, intrinsics.height)

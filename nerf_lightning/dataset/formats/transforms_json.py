@@ -1,4 +1,4 @@
-"""The frames of transforms.json and transforms_{train,val,test}.json: names, poses and intrinsics."""
+"""Frames of transforms.json and transforms_{train,val,test}.json: names, poses and intrinsics."""
 
 import logging
 import math
@@ -35,7 +35,7 @@ UNSUPPORTED_KEYS = (
     "ftheta_p2",
     "latlong",
 )
-"""Keys that bend rays in ways that no lens here does; 0 and false are no lens."""
+"""Keys of unsupported lens models; 0 and false are accepted."""
 SUPPORTED_KEYS = {
     *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "x_fov", "y_fov", "camera_model"),
     *("is_fisheye", "k1", "k2", "k3", "k4", "p1", "p2", *UNSUPPORTED_KEYS),
@@ -43,7 +43,6 @@ SUPPORTED_KEYS = {
     *("train_filenames", "val_filenames", "test_filenames"),
 }  # fmt: skip
 MIN_FOV_RAD = 1e-9
-"""Of view, radians."""
 
 
 @dataclass(frozen=True)
@@ -53,41 +52,41 @@ class Frame:
     where: str
     """File and index, for messages."""
     values: Mapping[str, Any]
-    """What the entry says, or else the file of all frames."""
+    """Entries of the frame, with the file's top level as default."""
     c2w: Float[np.ndarray, "4 4"]
-    """OpenCV, the capture's world frame and unit."""
+    """OpenCV, world frame and unit of the capture."""
 
     @property
     def name(self) -> str:
-        """Of the photo."""
+        """Path of the photo in the file."""
         return str(self.values["file_path"])
 
     def get_number(self, key: str, default: float) -> float:
-        """A number, if it is there."""
+        """Gets a number, or the default if it is missing or null."""
         value = self.values.get(key)
         return default if value is None else checks.parse_number(self.where, key, value)
 
 
 def opengl_to_opencv(c2w: Float[np.ndarray, "V 4 4"]) -> Float[np.ndarray, "V 4 4"]:
-    """Camera to world from OpenGL's camera frame (x right, y up, z backward) to OpenCV's (y down, z forward)."""
+    """Converts camera-to-world poses from OpenGL camera axes (y up, z backward) to OpenCV's (y down, z forward)."""
     return c2w * np.array([1.0, -1.0, -1.0, 1.0])
 
 
 def read_frames(file: Path) -> list[Frame]:
-    """All frames of a JSON file in its order. Unknown keys are listed once.
+    """Reads all frames of a JSON file in order. Unknown keys are logged.
 
     Raises:
-        InputError: no frames, or poses that are none.
+        InputError: no frames, or invalid poses.
     """
-    content = read_json(file, "a JSON object", "mend it or export again")
+    content = read_json(file, "a JSON object", "fix it or export again")
     if not isinstance(content, dict):
         raise InputError(file, "", f"a JSON {type(content).__name__}", "a JSON object with frames")
     checks.require_keys(file, content, ["frames"])
     entries = content["frames"]
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise InputError(file, "frames", repr(entries)[:60], "objects with file_path and transform_matrix")
-    places, poses = [f"{file}: frames[{i}]" for i in range(len(entries))], []
-    for where, entry in zip(places, entries, strict=True):
+    locations, poses = [f"{file}: frames[{i}]" for i in range(len(entries))], []
+    for where, entry in zip(locations, entries, strict=True):
         checks.require_keys(where, entry, ["file_path", "transform_matrix"])
         if not isinstance(entry["file_path"], str):
             raise InputError(where, "file_path", repr(entry["file_path"])[:60], "a string")
@@ -95,13 +94,13 @@ def read_frames(file: Path) -> list[Frame]:
     rigid = torch.from_numpy(opengl_to_opencv(checks.check_poses(file, "frames[{}].transform_matrix", np.stack(poses))))
     c2w = transform_poses(rigid, torch.from_numpy(invert_applied_transform(file, content))).numpy()
     if unused := sorted({*content, *(key for entry in entries for key in entry)} - SUPPORTED_KEYS):
-        log.info("%s: keys that are not used: %s", file, ", ".join(unused))
-    own = [{key: value for key, value in entry.items() if value is not None} for entry in entries]
-    return [Frame(where, {**content, **values}, pose) for where, values, pose in zip(places, own, c2w, strict=True)]
+        log.info("%s: ignoring unknown keys: %s", file, ", ".join(unused))
+    entries = [{key: value for key, value in entry.items() if value is not None} for entry in entries]
+    return [Frame(where, {**content, **x}, pose) for where, x, pose in zip(locations, entries, c2w, strict=True)]
 
 
 def parse_matrix(where: object, key: str, value: Any) -> Float[np.ndarray, "4 4"]:
-    """A matrix of 3 or 4 rows of 4 numbers; the fourth row is 0 0 0 1 if absent."""
+    """Parses a matrix of 3 or 4 rows of 4 numbers; the fourth row is 0 0 0 1 if absent."""
     matrix = checks.parse_floats(where, key, value)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise InputError(where, key, f"shape {matrix.shape}", "4 rows of 4 numbers")
@@ -109,9 +108,9 @@ def parse_matrix(where: object, key: str, value: Any) -> Float[np.ndarray, "4 4"
 
 
 def invert_applied_transform(file: Path, content: Mapping[str, Any]) -> Float[np.ndarray, "4 4"]:
-    """Similarity from the file's world frame back to that of the capture.
+    """Similarity from the file's world frame to that of the capture.
 
-    nerfstudio turns the capture by `applied_transform` and then scales it by `applied_scale`; exports have its place and unit.
+    nerfstudio applies `applied_transform` to the capture, and then `applied_scale`; exports are in the capture's frame.
     """
     applied = parse_matrix(file, "applied_transform", content.get("applied_transform", np.eye(4)))
     applied[:3] *= checks.parse_number(file, "applied_scale", content.get("applied_scale", 1.0))
@@ -119,7 +118,7 @@ def invert_applied_transform(file: Path, content: Mapping[str, Any]) -> Float[np
 
 
 def read_size(frame: Frame) -> tuple[int, int] | None:
-    """Width and height in pixels that a file states for a camera, None where it states none."""
+    """Reads a camera's width and height in pixels; None if not stated."""
     width, height = round(frame.get_number("w", 0)), round(frame.get_number("h", 0))
     if min(width, height) < 0:
         raise InputError(frame.where, "w, h", f"{width}x{height}", "the pixels of a photo")
@@ -127,7 +126,7 @@ def read_size(frame: Frame) -> tuple[int, int] | None:
 
 
 def read_intrinsics(frame: Frame, width: int, height: int) -> Intrinsics:
-    """Intrinsics of one frame for photos of a size, in pixels of that size."""
+    """Reads the intrinsics of one frame, in pixels of photos of the given size."""
     model = frame.values.get("camera_model") or "OPENCV"
     if model not in (*PERSPECTIVE_MODELS, *FISHEYE_MODELS, EQUIRECTANGULAR_MODEL):
         expected = f"one of {', '.join((*PERSPECTIVE_MODELS, *FISHEYE_MODELS, EQUIRECTANGULAR_MODEL))}"
@@ -143,7 +142,7 @@ def read_intrinsics(frame: Frame, width: int, height: int) -> Intrinsics:
         value = frame.values.get(key)
         if any(value) if isinstance(value, list) else value not in (None, False, 0, "0"):
             expected = f"at most {', '.join(names)}"
-            raise InputError(frame.where, key, repr(value)[:60], expected, "calibrate or export with these alone")
+            raise InputError(frame.where, key, repr(value)[:60], expected, "calibrate or export with only these")
     fx, fy = read_focal(frame, "x", width, fisheye), read_focal(frame, "y", height, fisheye)
     if not (fx := fx or fy) or not (fy := fy or fx):
         found = f"no focal length among [{', '.join(sorted(frame.values))}]"
@@ -155,10 +154,10 @@ def read_intrinsics(frame: Frame, width: int, height: int) -> Intrinsics:
 
 
 def read_focal(frame: Frame, axis: str, side: int, fisheye: bool) -> float:
-    """Focal length along an axis in pixels: `fl_x` first, then `camera_angle_x` in radians, then `x_fov` in degrees; else 0."""
+    """Reads a focal length in pixels: from `fl_x`, `camera_angle_x` (radians) or `x_fov` (degrees), in this order; else 0."""
     angle = frame.get_number(f"camera_angle_{axis}", math.radians(frame.get_number(f"{axis}_fov", 0.0)))
-    if (given := frame.get_number(f"fl_{axis}", 0.0)) or not angle:
-        return given
+    if (focal := frame.get_number(f"fl_{axis}", 0.0)) or not angle:
+        return focal
     if not MIN_FOV_RAD < angle < math.pi:
-        raise InputError(frame.where, f"camera_angle_{axis}", f"{angle:g}", "radians, between 0 and pi")
+        raise InputError(frame.where, f"camera_angle_{axis}", f"{angle:g}", "a field of view in radians, below pi")
     return side / (angle if fisheye else 2 * math.tan(0.5 * angle))

@@ -1,1 +1,1 @@
-"""Matches between photos: whether cameras explain them, what was mistaken where they do not, and points in space from them."""
+"""Feature matching between photos: epipolar checks of the poses, diagnosis of wrong ones, and triangulation."""

@@ -1,4 +1,4 @@
-"""How much of the matches between photos cameras explain, by epipolar geometry on the sphere of directions."""
+"""Epipolar inlier ratio of matches between photos, for given cameras, on the unit sphere of directions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,51 +13,48 @@ from nerf_lightning.cameras.lenses import normalized_to_directions, undistort
 from nerf_lightning.dataset.matching.features import Pair
 
 MAX_PAIR_MATCHES = 60
-"""Of a pair: more would not tell more."""
 MATCH_TOLERANCE, MIN_TOLERANCE_PX, DISPLACEMENT_TOLERANCE = 0.012, 1.0, 0.3
-"""Distance of a match from where the cameras allow it, as a share of the longest side, its least in pixels, and its most as a
-share of how far the pair's matches are displaced."""
+"""Epipolar tolerance relative to the longest side, its minimum in pixels, and its maximum relative to the pair's
+displacement."""
 MIN_DEPTH_BASELINES = 0.5
-"""Of what photos show, in distances between the two cameras."""
+"""Minimum depth of a match, in baselines."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """The matches of P pairs of photos, M in all, as directions in their cameras' frames."""
+    """M matches of P photo pairs, as directions in camera frames."""
 
     views: Int[np.ndarray, "P 2"]
-    """Of each pair."""
+    """Photos of each pair."""
     pair: Int[np.ndarray, "M"]
-    """That each match is of."""
+    """Pair of each match."""
     first: Float[np.ndarray, "M 3"]
     second: Float[np.ndarray, "M 3"]
     """Unit directions in the two cameras' frames."""
     tolerance: Float[np.ndarray, "M"]
-    """Radians at the second photo's middle."""
+    """Radians at the centre of the second photo."""
     fisheye: Bool[np.ndarray, "M"]
 
     @classmethod
     def from_pairs(cls, pairs: Sequence[Pair], cameras: Cameras) -> "Matches":
-        some = [one.keypoints[:: -(-len(one.keypoints) // MAX_PAIR_MATCHES)] for one in pairs]
-        pair = np.repeat(np.arange(len(pairs)), [len(keypoints) for keypoints in some])
-        keypoints = torch.from_numpy(np.concatenate(some)).float()
-        views = np.array([(one.first, one.second) for one in pairs])
-        first, second = (unproject(cameras, views[pair, side], keypoints[:, side]) for side in (0, 1))
+        subsets = [pair.keypoints[:: -(-len(pair.keypoints) // MAX_PAIR_MATCHES)] for pair in pairs]
+        index = np.repeat(np.arange(len(pairs)), [len(keypoints) for keypoints in subsets])
+        keypoints = torch.from_numpy(np.concatenate(subsets)).float()
+        views = np.array([(pair.first, pair.second) for pair in pairs])
+        first, second = (unproject(cameras, views[index, side], keypoints[:, side]) for side in (0, 1))
         longest, focal = (x.double().numpy()[views[:, 1]] for x in (cameras.sizes.amax(1), cameras.K[:, 0, 0]))
-        moved = np.array([one.displacement for one in pairs])
-        tolerance = (
-            np.minimum((MATCH_TOLERANCE * longest).clip(MIN_TOLERANCE_PX), DISPLACEMENT_TOLERANCE * moved) / focal
-        )
-        bent = np.zeros(len(cameras), bool)
+        max_tolerance = DISPLACEMENT_TOLERANCE * np.array([pair.displacement for pair in pairs])
+        tolerance = np.minimum((MATCH_TOLERANCE * longest).clip(MIN_TOLERANCE_PX), max_tolerance) / focal
+        fisheye = np.zeros(len(cameras), bool)
         if cameras.lenses is not None:
-            bent = (cameras.lenses.projection == Projection.FISHEYE).numpy()
-        return cls(views, pair, first, second, tolerance[pair], bent[views[pair, 1]])
+            fisheye = (cameras.lenses.projection == Projection.FISHEYE).numpy()
+        return cls(views, index, first, second, tolerance[index], fisheye[views[index, 1]])
 
 
 def unproject(
     cameras: Cameras, view: Int[np.ndarray, "M"], keypoints: Float[Tensor, "M 2"]
 ) -> Float[np.ndarray, "M 3"]:
-    """Unit directions, camera frame, of places in photos, pixels."""
+    """Unprojects pixels to unit directions in the camera frame."""
     index = torch.from_numpy(view)
     local = pixel_to_camera(cameras.K[index], keypoints, torch.ones(len(keypoints)))
     if cameras.lenses is not None:
@@ -69,17 +66,17 @@ def unproject(
 def find_inliers(
     matches: Matches, c2w: Float[np.ndarray, "V 4 4"], zoom: float = 1.0, tolerance: float = 1.0
 ) -> Bool[np.ndarray, "M"]:
-    """Which matches cameras allow: something before both, no nearer than `MIN_DEPTH_BASELINES`, would appear in both places.
+    """Epipolar inliers: matches of a point in front of both cameras, at a depth of at least `MIN_DEPTH_BASELINES`.
 
-    What the first photo shows at one place draws an arc of a great circle around the second camera as its depth varies; cameras
-    on one spot see it in one direction. The angle between that arc and where the second photo shows it must be small.
+    As its depth varies, a point of the first photo draws an arc of a great circle around the second camera (a single
+    direction for coincident cameras). The angle between that arc and the second direction must be within the tolerance.
     """
     cameras = c2w[matches.views]
-    back = cameras[:, 1, :3, :3].transpose(0, 2, 1)
-    turn, shift = back @ cameras[:, 0, :3, :3], back @ (cameras[:, 0, :3, 3:] - cameras[:, 1, :3, 3:])
+    w2c = cameras[:, 1, :3, :3].transpose(0, 2, 1)
+    rotation, baseline = w2c @ cameras[:, 0, :3, :3], w2c @ (cameras[:, 0, :3, 3:] - cameras[:, 1, :3, 3:])
     first, second = (_unit(x * [1, 1, zoom]) for x in (matches.first, matches.second))
-    farthest = (turn[matches.pair] @ first[..., None])[..., 0]
-    nearest = _unit(MIN_DEPTH_BASELINES * farthest + _unit(shift[:, :, 0])[matches.pair])
+    farthest = (rotation[matches.pair] @ first[..., None])[..., 0]
+    nearest = _unit(MIN_DEPTH_BASELINES * farthest + _unit(baseline[:, :, 0])[matches.pair])
     normal = _unit(np.cross(farthest, nearest))
     is_between = (np.cross(farthest, second) * normal).sum(1) >= 0
     is_between &= (np.cross(second, nearest) * normal).sum(1) >= 0
@@ -87,13 +84,13 @@ def find_inliers(
     ends = np.minimum(
         *(2 * np.arcsin(np.linalg.norm(end - second, axis=1).clip(0, 2) / 2) for end in (farthest, nearest))
     )
-    # A pixel far from a pinhole camera's axis shows a smaller angle.
+    # Pixels far from a pinhole camera's axis subtend smaller angles.
     pixel = np.where(matches.fisheye, 1.0, second[:, 2] ** 2) / zoom * tolerance
     return np.where(is_between & (normal != 0).any(1), arc_distance, ends) <= matches.tolerance * pixel
 
 
 def _unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
-    """Of length 1, or 0."""
+    """Normalizes vectors; zero stays zero."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.where(length > 1e-9, vectors / length.clip(1e-9), 0.0)
 
@@ -101,5 +98,5 @@ def _unit(vectors: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "N 3"]:
 def compute_inlier_ratio(
     matches: Matches, c2w: Float[np.ndarray, "V 4 4"], zoom: float = 1.0, tolerance: float = 1.0
 ) -> float:
-    """Share of the matches that cameras allow, see `find_inliers`."""
+    """Computes the fraction of epipolar inliers, see `find_inliers`."""
     return float(find_inliers(matches, c2w, zoom, tolerance).mean())

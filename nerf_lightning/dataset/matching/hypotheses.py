@@ -1,4 +1,4 @@
-"""Mistakes that people make with the cameras of a file."""
+"""Hypotheses for wrong poses: common mistakes with conventions and order."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -14,115 +14,115 @@ Rotations = Float[np.ndarray, "V 3 3"]
 Poses = Float[np.ndarray, "V 4 4"]
 
 OPENGL_FLIP = np.diag([1.0, -1.0, -1.0])
-"""Camera axes of OpenGL in OpenCV's, and the reverse."""
+"""Converts camera axes between OpenGL and OpenCV."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Cameras that a file may mean, and what is wrong with it if it does."""
+    """Possible intended cameras of a file, and the fault in the file if they are right."""
 
     fault: str
     hint: str
     c2w: Poses
-    """OpenCV; in no particular world frame, as only relative poses count. Mirrored cameras have det R = -1."""
+    """OpenCV; any world frame, since only relative poses matter. Mirrored cameras have det R = -1."""
     zoom: float = 1.0
-    """Focal length, in those given."""
+    """Focal length, relative to the file's."""
     is_rare: bool = False
-    """Whether hardly anybody errs so: it must explain clearly more than the others."""
+    """Whether the mistake is rare: it must explain clearly more matches than the others."""
 
 
 def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
-    """What other tools' conventions make of poses; the likeliest first.
+    """Lists poses under other conventions, most likely first.
 
     Args:
         c2w: as read, OpenCV, in the file's world frame.
     """
     rotation, centre = c2w[:, :3, :3], c2w[:, :3, 3:]
     transposed = rotation.transpose(0, 2, 1)
-    of_inverse = -transposed @ centre
+    inverse_centre = -transposed @ centre
     flips, changes = (np.eye(3), OPENGL_FLIP), list_axis_changes()[1:]
 
     def suppose(
         fault: str, hint: str, rotation: Rotations, centre: Float[np.ndarray, "V 3 1"], is_rare: bool = False
     ) -> Hypothesis:
-        moved = c2w.copy()
-        moved[:, :3] = np.concatenate([rotation, centre], axis=2)
-        return Hypothesis(fault, hint, moved, is_rare=is_rare)
+        poses = c2w.copy()
+        poses[:, :3] = np.concatenate([rotation, centre], axis=2)
+        return Hypothesis(fault, hint, poses, is_rare=is_rare)
 
     axes = "camera axes of the other convention: OpenCV has y down and z forward, OpenGL y up and z backward"
     yield suppose(axes, "negate the second and third column of each rotation", rotation @ OPENGL_FLIP, centre)
-    inverse = "world-to-camera matrices, where camera-to-world ones belong"
+    inverse = "world-to-camera matrices instead of camera-to-world"
     for flip in flips:
-        yield suppose(inverse, "invert each matrix", transposed @ flip, of_inverse)
+        yield suppose(inverse, "invert each matrix", transposed @ flip, inverse_centre)
     for left, right in product(flips, repeat=2):
-        fault = "transposed rotations beside the cameras' centres"
+        fault = "transposed rotations with camera centres"
         yield suppose(fault, "transpose each rotation", left @ transposed @ right, centre)
     for flip in flips:
-        fault = "camera-to-world rotations beside translations of world-to-camera matrices"
-        hint = "put the cameras' centres -R t in the fourth column"
+        fault = "camera-to-world rotations with world-to-camera translations"
+        hint = "put the camera centres -R t in the fourth column"
         yield suppose(fault, hint, rotation, -rotation @ flip @ centre)
     for change in changes:
         if np.linalg.det(change) < 0:
             fault = "a mirrored world: left-handed axes, or photos that are flipped"
             hint = "negate one axis, of the world and of the cameras, or flip the photos back"
         elif change[2, 2] == 1:
-            fault = "photos that lie on their sides or upside down in their cameras"
-            hint = "turn them, as dataset.orientation=exif does where their EXIF data say so"
+            fault = "photos that are rotated by 90 or 180 degrees relative to their cameras"
+            hint = "rotate them; dataset.orientation=exif does so by their EXIF data"
         else:
-            fault, hint = "camera axes in another order", "the columns of a rotation are the camera's axes in the world"
+            fault, hint = "permuted camera axes", "the columns of a rotation are the camera's axes in the world"
         yield suppose(fault, hint, rotation @ change, centre, is_rare=bool(change[2, 2] != 1))
-        yield suppose(f"{inverse}, of other axes", "invert each matrix", transposed @ change, of_inverse, is_rare=True)
-    fault, hint = "rotations of quaternions in another order", "the order is w, x, y, z"
+        fault = f"{inverse}, with permuted axes"
+        yield suppose(fault, "invert each matrix", transposed @ change, inverse_centre, is_rare=True)
+    fault, hint = "quaternions in another order", "the order is w, x, y, z"
     for backward in (False, True):
         for flip in flips:
             yield suppose(fault, hint, roll_quaternions(rotation @ flip, backward) @ flip, centre)
-        turned = roll_quaternions(transposed, backward).transpose(0, 2, 1)
-        yield suppose(fault, hint, turned, -turned @ of_inverse)  # world-to-camera poses keep their translations
+        rolled = roll_quaternions(transposed, backward).transpose(0, 2, 1)
+        yield suppose(fault, hint, rolled, -rolled @ inverse_centre)  # world-to-camera poses keep their translations
     for flip, change in product(flips, changes):
-        fault, hint = "centres in another world frame than rotations", "turn both alike"
+        fault, hint = "centres and rotations in different world frames", "rotate both to one frame"
         yield suppose(fault, hint, rotation @ flip, change @ centre, is_rare=True)
 
 
 def list_axis_changes() -> list[Float[np.ndarray, "3 3"]]:
-    """The 48 ways to name three axes: the identity, the other rotations, then mirrors."""
-    every = [
+    """Lists the 48 signed axis permutations: the identity, the other rotations, then mirrors."""
+    changes = [
         np.eye(3)[list(order)] * np.array(signs)[:, None]
         for order in permutations(range(3))
         for signs in product((1.0, -1.0), repeat=3)
     ]
-    return sorted(every, key=lambda one: (np.linalg.det(one) < 0, -np.trace(one)))
+    return sorted(changes, key=lambda change: (np.linalg.det(change) < 0, -np.trace(change)))
 
 
 def roll_quaternions(rotation: Rotations, backward: bool) -> Rotations:
-    """Rotations of the same quaternions, had x, y, z, w been read as w, x, y, z, or in reverse."""
+    """Reorders the quaternions of rotations, as if x, y, z, w had been read as w, x, y, z, or backward."""
     stored = Rotation.from_matrix(rotation).as_quat()  # x, y, z, w
     return Rotation.from_quat(np.roll(stored, 2 * backward - 1, axis=1)).as_matrix()
 
 
 def list_orders(names: Sequence[str], c2w: Poses, indices: Int[np.ndarray, "K"]) -> Iterator[Hypothesis]:
-    """Poses in another order than the photos.
+    """Lists poses in another order than the photos.
 
     Args:
-        names: of the first photos, which may be in another order.
-        c2w: of all photos.
-        kept: those whose poses count.
+        names: names of the first photos, whose poses may be reordered.
+        c2w: poses of all photos.
+        indices: photos in the hypotheses.
     """
-    every = range(len(names))
-    alphabetical = np.array(sorted(every, key=lambda i: names[i]))
-    numeric = np.array(sorted(every, key=lambda i: make_natural_key(names[i])))
+    alphabetical = np.array(sorted(range(len(names)), key=lambda i: names[i]))
+    numeric = np.array(sorted(range(len(names)), key=lambda i: make_natural_key(names[i])))
 
     def suppose(fault: str, source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Hypothesis:
-        moved = c2w.copy()
-        moved[target] = c2w[source]
-        return Hypothesis(fault, "give each photo its own pose", moved[indices])
+        poses = c2w.copy()
+        poses[target] = c2w[source]
+        return Hypothesis(fault, "assign each photo its own pose", poses[indices])
 
     for order in (alphabetical, numeric):
-        for step, where in ((1, "before"), (-1, "after")):
-            # Read: each photo has the pose of the one before it; so its own is at the next.
-            fault = f"poses that are those of the photos {where} them in the order of names"
+        for step, neighbour in ((1, "previous"), (-1, "next")):
+            # As read, each photo has the pose of the previous one; so its own is at the next.
+            fault = f"poses shifted by one: each photo has that of the {neighbour} one by name"
             yield suppose(fault, np.roll(order, -step), order)
         yield suppose("poses in the reverse order of the photos", order[::-1], order)
-    fault = "poses in another order than the photos, whose names sort otherwise as numbers (2, 10) than as text (10, 2)"
+    fault = "poses in another order than the photos: names sorted as numbers (2, 10) versus text (10, 2)"
     if (alphabetical != numeric).any():
         yield suppose(fault, alphabetical, numeric)
         yield suppose(fault, numeric, alphabetical)

@@ -1,4 +1,4 @@
-"""Points between photos of known pose: a few SIFT matches, triangulated."""
+"""Triangulation of SIFT matches between photos of known pose."""
 
 import logging
 from dataclasses import replace
@@ -18,23 +18,22 @@ from nerf_lightning.utils.text import subsample
 log = logging.getLogger(__name__)
 
 MAX_PAIRS = 8
-"""Pairs of photos that are matched."""
+"""Matched pairs of photos."""
 MIN_AXIS_COSINE = 0.85
-"""Least cosine between the axes of photos that are matched."""
+"""Minimum cosine between the axes of matched photos."""
 MAX_ERROR_PX, REFERENCE_SIDE_PX = 2.0, 640
-"""Largest reprojection error of a point, pixels; of larger photos, as many times more."""
+"""Largest reprojection error of a point up to the reference side; larger for larger photos."""
 MIN_PARALLAX_RAD = 0.005
-"""Least angle between two rays, radians, that tells a depth; farther points are put where it would be that."""
+"""Minimum triangulation angle; farther points are moved to the depth of that angle."""
 
 
 def triangulate_matches(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[Tensor, "M 3"]:
-    """Triangulates matches between pairs of photos that look in nearly the same direction from different places.
+    """Triangulates matches between photos that look in nearly the same direction from different positions.
 
-    A match counts where its rays meet in front of both cameras. Points too far to tell their depth are put as near as they
-    may be.
+    Keeps points in front of both cameras. Points below `MIN_PARALLAX_RAD` get the largest measurable depth.
 
     Args:
-        views: photos; the poses of their cameras do not count.
+        views: photos; the poses of their cameras are ignored.
         c2w: OpenCV camera to world, in the frame of the points.
     """
     local = torch.from_numpy(c2w).clone()
@@ -42,23 +41,23 @@ def triangulate_matches(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[
     local[:, :3, 3] -= origin
     cameras = replace(views.cameras, c2w=local.float())
     pairs = find_neighbours(local)
-    found = [torch.zeros(0, 3)]
+    parts = [torch.zeros(0, 3)]
     for pair in pairs:
         keypoints = match_features(*(detect_features(views, view) for view in pair))
-        found.append(triangulate(cameras[torch.tensor(pair)], torch.from_numpy(keypoints)))
-    points = torch.cat(found)
-    log.info("%d points from matches between %d pairs of photos", len(points), len(pairs))
+        parts.append(triangulate(cameras[torch.tensor(pair)], torch.from_numpy(keypoints)))
+    points = torch.cat(parts)
+    log.info("triangulated %d points from %d pairs of photos", len(points), len(pairs))
     return points.double() + origin
 
 
 def find_neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
-    """Pairs of photos, spread over a capture: one each of which has the median baseline among those that look alike."""
+    """Finds pairs spread over the capture: each view with the median-baseline one of similar direction."""
     axes, centres = normalize(c2w[:, :3, 2], dim=1), c2w[:, :3, 3]
     pairs = set()
     for view in subsample(len(c2w), MAX_PAIRS):
-        alike = axes @ axes[view]
-        alike[view] = -1
-        others = (alike >= min(MIN_AXIS_COSINE, float(alike.max()))).nonzero()[:, 0]
+        cosine = axes @ axes[view]
+        cosine[view] = -1
+        others = (cosine >= min(MIN_AXIS_COSINE, float(cosine.max()))).nonzero()[:, 0]
         baseline = (centres[others] - centres[view]).norm(dim=1)
         other = int(others[baseline.argsort()[len(others) // 2]])
         if other != view:
@@ -67,14 +66,14 @@ def find_neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
 
 
 def triangulate(cameras: Cameras, keypoints: Float[Tensor, "N 2 2"]) -> Float[Tensor, "M 3"]:
-    """Points that two cameras see where they are said to, in pixels of their photos, in front of both."""
+    """Triangulates keypoints of two cameras, in pixels; keeps points in front of both with a small reprojection error."""
     a, b = (
         torch.from_numpy(unproject(cameras, np.full(len(keypoints), view), keypoints[:, view].float()))
         @ cameras.c2w[view, :3, :3].double().T
         for view in (0, 1)
     )
     baseline = (cameras.centres[1] - cameras.centres[0]).double()
-    # Least squares for s a - t b = baseline; the angle is held above the least that tells a depth.
+    # Least squares for s a - t b = baseline.
     sine = torch.linalg.cross(a, b).norm(dim=1)
     cosine = (a * b).sum(1)
     s = ((a - cosine[:, None] * b) @ baseline) / sine.square().clamp_min(1e-12)
@@ -84,7 +83,7 @@ def triangulate(cameras: Cameras, keypoints: Float[Tensor, "N 2 2"]) -> Float[Te
     points = cameras.centres[0].double() + torch.where(is_far, farthest, s)[:, None] * a
     kept = torch.ones(len(points), dtype=torch.bool)
     for view in (0, 1):
-        pixels, _, seen = cameras.project(points.float(), view)
-        off = (pixels.double() - keypoints[:, view]).norm(dim=1)
-        kept &= seen & (off < MAX_ERROR_PX * max(1.0, max(cameras.size(view)) / REFERENCE_SIDE_PX))
+        pixels, _, visible = cameras.project(points.float(), view)
+        error = (pixels.double() - keypoints[:, view]).norm(dim=1)
+        kept &= visible & (error < MAX_ERROR_PX * max(1.0, max(cameras.size(view)) / REFERENCE_SIDE_PX))
     return points[kept].float()

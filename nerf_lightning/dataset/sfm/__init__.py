@@ -1,1 +1,1 @@
-"""From plain photos or a video to photos with known cameras: structure from motion."""
+"""Structure from motion: poses and lenses of plain photos or a video."""

@@ -1,4 +1,4 @@
-"""Folders in the cache that keep what was made of photos or a video, so that a second run does not make it again."""
+"""Cache of reconstructions and video frames, so that later runs reuse them."""
 
 import hashlib
 import logging
@@ -11,26 +11,26 @@ from nerf_lightning.utils.parsing import read_json
 log = logging.getLogger(__name__)
 
 RECORD_FILE = "made_of.json"
-"""In each such folder: names, sizes in bytes and times of the last change, in nanoseconds, of the files it was made of."""
+"""File in each cached folder: names, sizes in bytes and modification times in ns of its source files."""
 
 
 def build_cached_folder(source: Path, files: Sequence[Path], fill: Callable[[Path], None]) -> Path:
-    """The folder that was made of the same files before, or is made now.
+    """Returns the cached folder for the files, building it if needed.
 
     Args:
-        source: what the user named, which tells folders apart.
-        files: that it is made of.
-        fill: writes what belongs there into an empty folder.
+        source: path given by the user, the cache key.
+        files: source files, whose changes invalidate the folder.
+        fill: writes the contents into an empty folder.
     """
-    states = {file.name: file.stat() for file in files}
-    made_of = {name: [state.st_size, state.st_mtime_ns] for name, state in states.items()}
+    stats = {file.name: file.stat() for file in files}
+    record = {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
     folder = cache_folder() / "sfm" / hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:16]
     if (folder / RECORD_FILE).is_file():
-        if read_json(folder / RECORD_FILE, "what it was made of; delete the folder to make it again") == made_of:
-            log.info("%s: kept from an earlier run", folder)
+        if read_json(folder / RECORD_FILE, "the record of its source files; delete the folder to rebuild it") == record:
+            log.info("%s: reused from an earlier run", folder)
             return folder
-        log.info("%s was made of other files: it is made again", folder)
+        log.info("%s: rebuilding, the source files changed", folder)
     with atomic_write_folder(folder) as temporary:
         fill(temporary)
-        write_json(temporary / RECORD_FILE, made_of)
+        write_json(temporary / RECORD_FILE, record)
     return folder

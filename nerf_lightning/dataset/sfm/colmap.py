@@ -1,4 +1,4 @@
-"""Structure from motion with COLMAP (Schoenberger and Frahm 2016): photos -> lenses, cameras and points of the scene."""
+"""Structure from motion with COLMAP (Schoenberger and Frahm 2016): photos -> lenses, poses and points."""
 
 import itertools
 import logging
@@ -30,44 +30,44 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MIN_PHOTOS = 3
-"""Of which a scene can be made."""
+"""Registered photos for a scene."""
 COPY_SIDE_PX = 1600
-"""Longest side in pixels of the copies in which COLMAP looks for features."""
+"""Longest side of the copies for feature detection."""
 MIN_OPENCV_PHOTOS = 6
-"""Photos of a lens from which the lens model OPENCV is found; fewer photos get a simpler one."""
+"""Photos of a lens needed for the model OPENCV; fewer photos get SIMPLE_RADIAL."""
 MAX_EXHAUSTIVE_PHOTOS = 150
-"""Photos up to which each is compared with each; beyond, with those near it in order."""
+"""Photos up to which matching is exhaustive; sequential beyond."""
 SEQUENTIAL_WINDOW, NUM_LOOP_PHOTOS = 20, 60
-"""In order, on either side; and photos, evenly chosen, that are compared with each other too, so that a round closes."""
+"""Sequential neighbours on either side; and evenly spaced photos that are matched exhaustively for loop closure."""
 PAIRS_PER_CALL = 300
-"""Pairs that are matched in one call: few enough that the bar moves."""
+"""Pairs per matching call, few enough for a smooth progress bar."""
 MAX_ERROR_FRACTION = 0.004
-"""Reprojection distance up to which a match with photos of known pose holds, in longest sides: 4 pixels at 1000."""
+"""Largest reprojection error with known poses, relative to the longest side: 4 pixels at 1000."""
 MIN_POSE_POINTS = 15
-"""That must agree on a pose: five times as many as determine one, so that chance matches do not."""
+"""Minimum inliers of a pose: five times the minimal set, to exclude chance."""
 MAKE_TAG, MODEL_TAG, FOCAL_TAG, FOCAL_35MM_TAG = 0x010F, 0x0110, 0x920A, 0xA405
-"""Numbers of the EXIF tags from which COLMAP takes the focal length, in millimetres."""
+"""EXIF tag ids from which COLMAP derives the focal length, in millimetres."""
 
 
 def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruction | None":
-    """The largest model that COLMAP makes of photos; None where it makes none.
+    """Reconstructs photos with COLMAP and returns the largest model; None if there is none.
 
-    Its cameras and pixels are those of the upright, full-size photos, its images have the photos' names. Photos of one size,
-    camera and focal length share a lens, which starts from the focal length that they tell.
+    Cameras and pixels refer to the upright, full-size photos; images have the photos' names. Photos of one size, camera and
+    focal length share a lens, initialized from EXIF.
 
     Args:
-        photos: of any sizes and cameras, in the order in which they were taken.
-        workspace: an empty folder for copies and matches.
+        photos: of any sizes and cameras, in the order taken.
+        workspace: empty folder for copies and matches.
 
     Raises:
-        InputError: a photo cannot be read.
+        InputError: a photo is unreadable.
     """
     import pycolmap
 
     database, copies, sizes = match_photos(photos, workspace)
     options = pycolmap.IncrementalPipelineOptions(min_model_size=MIN_PHOTOS, random_seed=0)
     (workspace / "models").mkdir()
-    with progress_bar(len(photos), "placing photos") as step:
+    with progress_bar(len(photos), "registering photos") as step:
         callbacks: dict[str, Any] = {
             "initial_image_pair_callback": lambda: step(2),
             "next_image_callback": lambda: step(1),
@@ -82,17 +82,17 @@ def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruc
 def register_with_known_poses(
     photos: Sequence[Path], lens: Intrinsics, known: Mapping[int, Float[np.ndarray, "4 4"]], workspace: Path
 ) -> dict[int, tuple[Float[np.ndarray, "4 4"], float]]:
-    """Places photos against those whose poses are known, which stay as they are, and so do the lens, the scale and the frame.
+    """Registers photos with those of known pose; known poses, lens, scale and frame stay fixed.
 
     COLMAP triangulates points from the known poses and registers the other photos one after the other.
 
     Args:
-        photos: all, of one lens, in the order in which they were taken.
-        known: world to camera, by the photo's index.
-        workspace: an empty folder for copies and matches.
+        photos: all photos, of one lens, in the order taken.
+        known: world to camera, by photo index.
+        workspace: empty folder for copies and matches.
 
     Returns:
-        World to camera, and the root mean square reprojection error in pixels, of the others that agree, by index.
+        World to camera and RMS reprojection error in pixels, by index, of the newly registered photos.
     """
     import pycolmap
 
@@ -130,22 +130,22 @@ def register_with_known_poses(
 def match_photos(
     photos: Sequence[Path], workspace: Path, camera: "pycolmap.Camera | None" = None
 ) -> tuple[Path, Path, list[tuple[int, int]]]:
-    """Finds features in copies of photos and matches them.
+    """Detects features in copies of photos and matches them.
 
     Args:
-        photos: in the order in which they were taken.
-        workspace: an empty folder.
-        camera: of all copies; None: what their EXIF tags tell.
+        photos: in the order taken.
+        workspace: empty folder.
+        camera: camera of all copies; None derives it from EXIF.
 
     Returns:
         COLMAP's database, the folder of the copies, and widths and heights of the upright photos.
 
     Raises:
-        InputError: a photo cannot be read.
+        InputError: a photo is unreadable.
     """
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # what fails is told in our own words
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value  # callers report failures
     pycolmap.set_random_seed(0)
     database, copies = workspace / "database.db", workspace / "photos"
     reader = pycolmap.ImageReaderOptions()
@@ -158,7 +158,7 @@ def match_photos(
         lenses = list(track_progress(written, len(photos), "reading photos"))
     for lens in dict.fromkeys(lenses):
         names = [make_copy_name(number) for number, other in enumerate(lenses) if other == lens]
-        log.info("looking for features in %d photos of %dx%d", len(names), *lens[0])
+        log.info("detecting features in %d photos of %dx%d", len(names), *lens[0])
         reader.camera_model = "OPENCV" if len(names) >= MIN_OPENCV_PHOTOS else "SIMPLE_RADIAL"
         pycolmap.extract_features(database, copies, names, pycolmap.CameraMode.SINGLE, reader)
     pairs = pair_photos(len(photos))
@@ -177,7 +177,7 @@ def match_photos(
 
 
 def pair_photos(count: int) -> list[tuple[int, int]]:
-    """Which photos are compared: all with all, or of many those near each other in order, and a few with each other."""
+    """Lists the pairs to match: exhaustive, or for many photos sequential with loop closure."""
     if count <= MAX_EXHAUSTIVE_PHOTOS:
         return list(itertools.combinations(range(count), 2))
     near = {(i, j) for i in range(count) for j in range(i + 1, min(i + SEQUENTIAL_WINDOW + 1, count))}
@@ -186,18 +186,17 @@ def pair_photos(count: int) -> list[tuple[int, int]]:
 
 
 def make_copy_name(number: int) -> str:
-    """The name of a photo's copy: COLMAP cannot read every name."""
+    """File name of a photo's copy, since COLMAP cannot read every name."""
     return f"{number:06d}.jpg"
 
 
 def parse_index(image: "pycolmap.Image") -> int:
-    """The number of the photo of a copy."""
+    """Parses the photo index from a copy's name."""
     return int(Path(image.name).stem)
 
 
 def _write_copy(photo: Path, file: Path) -> tuple[tuple[int, int], bytes]:
-    """Writes a small upright copy in a format that COLMAP reads; the full size and the EXIF tags, which photos of one lens
-    share."""
+    """Writes a reduced upright JPEG and returns the full size and the EXIF tags, which identify the lens."""
     image = Image.fromarray(np.ascontiguousarray(read_pixels(photo, upright=True)[..., :3]))
     tags = read_lens_tags(photo)
     small = image.resize(fit_size(*image.size, COPY_SIDE_PX), Image.Resampling.BOX)
@@ -206,7 +205,7 @@ def _write_copy(photo: Path, file: Path) -> tuple[tuple[int, int], bytes]:
 
 
 def read_lens_tags(photo: Path) -> bytes:
-    """The EXIF tags of a photo that tell of its lens; where they are broken, or there are none, nothing is known."""
+    """Reads the lens-related EXIF tags of a photo; empty if missing or broken."""
     tags, kept = read_header(photo).tags, Image.Exif()
     try:
         kept.update({tag: str(tags[tag]) for tag in (MAKE_TAG, MODEL_TAG) if tag in tags})
@@ -222,7 +221,7 @@ def read_lens_tags(photo: Path) -> bytes:
 
 
 def _fixed_pose_options(max_error: float) -> "pycolmap.IncrementalPipelineOptions":
-    """COLMAP's options: known poses and the lens are fixed, and matches hold up to an error in pixels."""
+    """COLMAP options with fixed known poses and lens, and a largest reprojection error in pixels."""
     import pycolmap
 
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, multiple_models=False, fix_existing_frames=True)
@@ -231,12 +230,12 @@ def _fixed_pose_options(max_error: float) -> "pycolmap.IncrementalPipelineOption
     options.mapper.abs_pose_min_num_inliers = MIN_POSE_POINTS
     options.mapper.abs_pose_max_error = options.mapper.filter_max_reproj_error = max_error
     options.triangulation.merge_max_reproj_error = options.triangulation.complete_max_reproj_error = max_error
-    options.triangulation.ignore_two_view_tracks = False  # poses are known: two views tell where a point is
+    options.triangulation.ignore_two_view_tracks = False  # two views of known pose suffice
     return options
 
 
 def _rescale_model(model: "pycolmap.Reconstruction", photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> None:
-    """Changes a model of copies into one of the photos; COLMAP's pixel centres are at +0.5, as ours are."""
+    """Rescales a model from the copies to the photos; COLMAP's pixel centres are at +0.5, as ours."""
     scales = {}
     for image in model.images.values():
         number, camera = parse_index(image), model.cameras[image.camera_id]
@@ -250,7 +249,7 @@ def _rescale_model(model: "pycolmap.Reconstruction", photos: Sequence[Path], siz
 
 
 def _compute_rms_error(image: "pycolmap.Image", model: "pycolmap.Reconstruction") -> float:
-    """Root mean square reprojection error over a photo's points, pixels."""
+    """Computes the RMS reprojection error of a photo's points, in pixels."""
     points = [point for point in image.points2D if point.has_point3D()]
     projected = [image.project_point(model.points3D[point.point3D_id].xyz) for point in points]
     squares = [((p - point.xy) ** 2).sum() for p, point in zip(projected, points, strict=True) if p is not None]

@@ -1,4 +1,4 @@
-"""A folder of photos: which files, in which order, and where their cameras stood."""
+"""Photo folders: lists the photos and reconstructs their cameras."""
 
 import logging
 import tempfile
@@ -14,17 +14,16 @@ from nerf_lightning.utils.text import join_truncated
 log = logging.getLogger(__name__)
 
 MODEL_FOLDER = Path("sparse") / "0"
-"""The model in the cached folder."""
 MAX_NAMES = 5
-"""That a line lists."""
+"""Names in a message."""
 
 
 def find_photos(folder: Path, key: str) -> list[Path]:
-    """The photos in a folder in natural order, without those in folders below it.
+    """Lists the photos of a folder in natural order, without subfolders.
 
     Args:
-        folder: where they are.
-        key: the config key that named it, for the message.
+        folder: folder of photos.
+        key: config key of the folder, for messages.
 
     Raises:
         InputError: no such folder, or no photo in it.
@@ -40,19 +39,18 @@ def find_photos(folder: Path, key: str) -> list[Path]:
 
 
 def run_sfm(folder: Path) -> Path:
-    """Places a folder's photos by structure from motion, once: a second call with the same photos reads nothing.
+    """Reconstructs a folder's photos by structure from motion; cached for the same photos.
 
-    The model is about the upright, full-size photos: whoever reads them applies the EXIF rotation. Its frame, and its scale,
-    are COLMAP's own.
+    The model refers to the upright, full-size photos: readers apply the EXIF rotation. Frame and scale are COLMAP's.
 
     Args:
-        folder: of photos of one scene; several sizes, cameras and focal lengths may be among them.
+        folder: photos of one scene, of any sizes, cameras and focal lengths.
 
     Returns:
-        The folder of a binary COLMAP model, in the cache.
+        Folder of a binary COLMAP model, in the cache.
 
     Raises:
-        InputError: pycolmap is not installed, a photo cannot be read, or the photos do not hang together.
+        InputError: pycolmap is not installed, a photo is unreadable, or the photos are not connected by matches.
     """
     photos = find_photos(folder, "dataset.path")
 
@@ -60,17 +58,14 @@ def run_sfm(folder: Path) -> Path:
         require_extra("colmap", "pycolmap", purpose="the optional extra for photos without cameras")
         with tempfile.TemporaryDirectory() as workspace:
             model = reconstruct(photos, Path(workspace))
-        placed = set() if model is None else {image.name for image in model.images.values() if image.has_pose}
-        if model is None or len(placed) < MIN_PHOTOS:
-            found = f"{len(placed)} of {len(photos)} photos that hang together"
-            advice = (
-                "take more photos, in small steps around the subject, sharp, of something with texture; or use tags"
-            )
-            raise InputError(folder, "", found, f"at least {MIN_PHOTOS}", advice)
-        log.info("%d of %d photos placed", len(placed), len(photos))
-        if missing := [photo.name for photo in photos if photo.name not in placed]:
-            names = join_truncated(missing, MAX_NAMES)
-            log.info("not placed, for they share too few points with the others: %s", names)
+        registered = set() if model is None else {image.name for image in model.images.values() if image.has_pose}
+        if model is None or len(registered) < MIN_PHOTOS:
+            found = f"{len(registered)} of {len(photos)} photos that COLMAP could register"
+            hint = "take more sharp photos, in small steps around a textured subject; or use tags"
+            raise InputError(folder, "", found, f"at least {MIN_PHOTOS}", hint)
+        log.info("%d of %d photos registered", len(registered), len(photos))
+        if missing := [photo.name for photo in photos if photo.name not in registered]:
+            log.info("not registered, too few points in common: %s", join_truncated(missing, MAX_NAMES))
         (empty / MODEL_FOLDER).mkdir(parents=True)
         model.write_binary(empty / MODEL_FOLDER)
 

@@ -1,4 +1,4 @@
-"""A video becomes a folder of photos: its sharpest frames, evenly spread over the camera's motion."""
+"""Extracts photos from a video: its sharpest frames, evenly spaced along the camera's motion."""
 
 import logging
 import math
@@ -25,42 +25,42 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 VIDEOS = {".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi", ".3gp", ".mts", ".m2ts", ".ts", ".mpg", ".mpeg", ".wmv"}
-"""Files that are taken for videos."""
+"""Video extensions."""
 MAX_FRAMES = 120
-"""Taken of a video if nobody says how many: one for every three degrees of a full turn."""
+"""Default maximum number of frames: one per three degrees of a full orbit."""
 MIN_STEP_FRACTION = 0.01
-"""Motion between two frames that are worth taking both, as a share of the longest side; likewise."""
+"""Minimum motion between chosen frames, relative to the longest side, by default."""
 SHARPNESS_WINDOW = 3
-"""Neighbouring frames of which the sharpest is taken."""
+"""Neighbouring frames from which the sharpest is chosen."""
 MIN_MOTION_PX = 0.05
-"""Motion in the small pictures that noise and compression make up where nothing moves."""
+"""Apparent motion caused by noise and compression, in pixels of the small frames."""
 SHARPNESS_SIDE, MOTION_SIDE = 960, 160
-"""Longest sides in pixels of the grey pictures in which sharpness and motion are measured."""
+"""Longest sides in pixels of the grey frames for measuring sharpness and motion."""
 JPEG_QUALITY = 95
 
 
 def extract_frames(video: Path) -> Path:
-    """The folder with a video's frames, in the cache.
+    """Extracts a video's frames into a folder in the cache, and returns it.
 
-    Frames that are there and were made of the same video stay as they are: whoever deletes some does not get them back.
+    Cached frames of the same video are reused as they are: deleted ones are not restored.
 
     Raises:
         InputError: see `write_frames`.
     """
     folder = build_cached_folder(video, [require_file(video)], lambda empty: write_frames(video, empty))
-    log.info("%s: %d frames are in %s", video, len(list(folder.glob("*.jpg"))), folder)
+    log.info("%s: %d frames in %s", video, len(list(folder.glob("*.jpg"))), folder)
     return folder
 
 
 def write_frames(video: Path, folder: Path, count: int | None = None) -> None:
-    """Writes the sharpest frame of each stretch of motion as a JPEG that is named after its number in the video, upright.
+    """Writes the sharpest frame of each interval of motion as an upright JPEG named by its frame number.
 
-    The video is decoded twice, to measure and to write, so that memory holds a few frames only.
+    The video is decoded twice, to measure and to write, so that memory holds only a few frames.
 
     Args:
-        video: of any kind that FFmpeg reads.
-        folder: an empty one.
-        count: how many at most; None: as many as its motion needs.
+        video: any format of FFmpeg.
+        folder: empty folder.
+        count: maximum number of frames; None: chosen by the motion.
 
     Raises:
         InputError: PyAV is not installed, the video is damaged, or has too few frames.
@@ -77,15 +77,15 @@ def write_frames(video: Path, folder: Path, count: int | None = None) -> None:
             imageio.imwrite(folder / f"{index:06d}.jpg", np.ascontiguousarray(upright), quality=JPEG_QUALITY)
 
 
-def decode_frames(video: Path, words: str) -> Iterator["av.VideoFrame"]:
-    """Decodes all whole frames of a video's first picture stream, with a progress bar; memory holds a few.
+def decode_frames(video: Path, label: str) -> Iterator["av.VideoFrame"]:
+    """Decodes all intact frames of a video's first video stream lazily, with a progress bar.
 
     Args:
-        video: of any kind that FFmpeg reads.
-        words: what the bar says.
+        video: any format of FFmpeg.
+        label: text of the progress bar.
 
     Raises:
-        InputError: PyAV is not installed; no video, one without pictures, or a damaged one.
+        InputError: PyAV is not installed, or the video is damaged or has no video stream.
     """
     require_extra("video", "av", purpose="the optional extra that reads videos", hint=", or give a folder of photos")
     import av
@@ -99,8 +99,8 @@ def decode_frames(video: Path, words: str) -> Iterator["av.VideoFrame"]:
             stream.thread_type = "AUTO"
             seconds = float(container.duration or 0) / av.time_base
             total = max(1, stream.frames or round(seconds * float(stream.average_rate or 0)))
-            for frame in track_progress(container.decode(stream), total, words):
-                if not frame.is_corrupt:  # FFmpeg paints over what is damaged
+            for frame in track_progress(container.decode(stream), total, label):
+                if not frame.is_corrupt:  # FFmpeg conceals damage
                     yield frame
     except av.FFmpegError as error:
         found = f"cannot be decoded ({error.strerror})"
@@ -108,22 +108,24 @@ def decode_frames(video: Path, words: str) -> Iterator["av.VideoFrame"]:
 
 
 def measure_frames(video: Path) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
-    """The motion that leads to each frame of a video, 0 for the first, and the sharpness of each."""
-    motion, sharpness, before = [], [], None
+    """Measures the motion up to each frame of a video, 0 for the first, and its sharpness."""
+    motion, sharpness, previous = [], [], None
     for frame in decode_frames(video, "measuring blur and motion"):
         size = fit_size(frame.width, frame.height, SHARPNESS_SIDE)
         picture = frame.reformat(*size, "gray", interpolation="AREA").to_ndarray()
         sharpness.append(measure_sharpness(picture))
         small = cv2.resize(picture, fit_size(*size, MOTION_SIDE), interpolation=cv2.INTER_AREA)
-        motion.append(measure_motion(before, small) if before is not None and before.shape == small.shape else 0.0)
-        before = small
+        motion.append(
+            measure_motion(previous, small) if previous is not None and previous.shape == small.shape else 0.0
+        )
+        previous = small
     return np.array(motion), np.array(sharpness)
 
 
 def measure_motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
-    """How far the content of two small pictures is shifted, as a share of their longest side.
+    """Measures the motion between two small frames, relative to their longest side.
 
-    The mean length of dense optical flow (Kroeger et al. 2016), weighted by contrast: plain areas show no motion.
+    The mean length of dense optical flow (Kroeger et al. 2016), weighted by contrast: textureless areas show no motion.
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)  # type: ignore[call-overload]
     contrast = np.hypot(*(cv2.Sobel(before, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))))
@@ -132,14 +134,13 @@ def measure_motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h
 
 
 def measure_sharpness(picture: UInt8[np.ndarray, "H W"]) -> float:
-    """Logarithm of a picture's fine detail over its coarse detail: variances of the Laplacian at two scales.
+    """Measures sharpness: log ratio of the Laplacian's variance at a fine and a coarse scale.
 
-    Neither exposure nor contrast changes it, and blur takes away the fine detail first. It does depend on what a picture
-    shows, so that only pictures of nearly the same can be compared.
+    Invariant to exposure and contrast; blur removes fine detail first. Comparable only between frames of similar content.
     """
     fine, coarse = (
         float(cv2.Laplacian(cv2.GaussianBlur(picture.astype(np.float32), (0, 0), sigma), cv2.CV_32F).var())
-        for sigma in (1.0, 3.0)  # the first takes noise away
+        for sigma in (1.0, 3.0)  # the first removes noise
     )
     return math.log((fine + 1e-6) / (coarse + 1e-6))
 
@@ -147,26 +148,26 @@ def measure_sharpness(picture: UInt8[np.ndarray, "H W"]) -> float:
 def select_frames(
     motion: Float[np.ndarray, "N"], sharpness: Float[np.ndarray, "N"], count: int | None = None
 ) -> list[int]:
-    """Divides a video into stretches of equal motion and takes the sharpest of the frames nearest to each one's middle.
+    """Selects the sharpest frame near the middle of each of `count` intervals of equal motion.
 
     Args:
-        motion: that leads to each frame.
-        sharpness: of each frame.
-        count: stretches; None: as many as the motion is worth, and as there are candidates for.
+        motion: motion up to each frame.
+        sharpness: sharpness of each frame.
+        count: intervals; None: chosen by the motion and the number of candidates.
 
     Returns:
-        Indices in order; fewer than `count` where the camera moves fast.
+        Sorted indices; fewer than `count` where the camera moves fast.
     """
     if count is None:
         moving = 1 + int(np.count_nonzero(motion > motion.mean() / 8))
-        worth = math.ceil(float(motion.sum()) / MIN_STEP_FRACTION)
-        count = max(MIN_PHOTOS, min(MAX_FRAMES, moving // SHARPNESS_WINDOW, worth))
-    # Frames where nothing moves count a little, so that a video of a still scene can be divided too.
+        max_steps = math.ceil(float(motion.sum()) / MIN_STEP_FRACTION)
+        count = max(MIN_PHOTOS, min(MAX_FRAMES, moving // SHARPNESS_WINDOW, max_steps))
+    # A small constant per frame, so that a video without motion can be divided too.
     path = np.cumsum(motion + 1e-6 * max(float(motion.sum()), 1.0) / len(motion))
     chosen, end = [], 0
     for middle in np.searchsorted(path, path[-1] * (np.arange(count) + 0.5) / count).tolist():
         start = max(end, middle - SHARPNESS_WINDOW // 2)
-        if start <= min(middle + SHARPNESS_WINDOW // 2, len(motion) - 1):  # else the frame before stands for it
+        if start <= min(middle + SHARPNESS_WINDOW // 2, len(motion) - 1):  # else covered by the previous interval
             end = min(start + SHARPNESS_WINDOW, len(motion))
             chosen.append(max(range(start, end), key=sharpness.__getitem__))
     return chosen

@@ -1,4 +1,4 @@
-// A camera as three axes and a place, as in cameras/transforms.py: right, down and ahead, in the world frame.
+// A camera: position and axes right, down and ahead in the world frame, as in cameras/transforms.py.
 
 const add = (a, b, by = 1) => [a[0] + by * b[0], a[1] + by * b[1], a[2] + by * b[2]];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -9,12 +9,12 @@ const between = (a, b, share) => a.map((x, i) => x + share * (b[i] - x));
 const turned = (a, axis, angle) =>          // Rodrigues' rotation
   add(add(scaled(a, Math.cos(angle)), cross(axis, a), Math.sin(angle)), axis, dot(axis, a) * (1 - Math.cos(angle)));
 
-const STEEPEST = 0.995;                     // cosine between ahead and up at which turning stops
+const STEEPEST = 0.995;                     // maximum cosine between ahead and up when turning
 class Camera {
-  // lens: width, height, fx, fy, cx, cy in pixels of the picture it was made for; target: what it turns around.
+  // lens: width, height, fx, fy, cx, cy in pixels of the original image; target: centre of rotation.
   constructor(right, down, ahead, eye, lens, target) { Object.assign(this, { right, down, ahead, eye, lens, target }); }
 
-  // Rows 3 x 4 of a camera-to-world matrix; it turns around the place on its axis that is nearest to the focus.
+  // From a 3 x 4 camera-to-world matrix; the target is the point on the optical axis nearest to the focus.
   static from(rows, lens, focus) {
     const column = i => [rows[i], rows[4 + i], rows[8 + i]], ahead = column(2), eye = column(3);
     const far = dot(add(focus, eye, -1), ahead), away = Math.hypot(...add(focus, eye, -1));
@@ -23,19 +23,19 @@ class Camera {
   copy() { return Object.assign(Object.create(Camera.prototype), this); }
   get distance() { return Math.hypot(...add(this.eye, this.target, -1)); }
 
-  // The lens on a canvas that holds its whole picture.
+  // Intrinsics on a canvas that shows the whole image.
   lensOn(width, height) {
     const [w, h, fx, fy, cx, cy] = this.lens, by = Math.min(width / w, height / h);
     return [fx * by, fy * by, (cx - w / 2) * by + width / 2, (cy - h / 2) * by + height / 2];
   }
 
-  // What march.glsl calls across, down and ahead.
+  // across, down and ahead of march.glsl.
   axes(width, height) {
     const [fx, fy, cx, cy] = this.lensOn(width, height), across = scaled(this.right, 1 / fx), down = scaled(this.down, 1 / fy);
     return [across, down, add(add(this.ahead, across, -cx), down, -cy)];
   }
 
-  // Where a place appears on a canvas, or null behind the camera.
+  // Canvas position of a point, or null behind the camera.
   project(place, width, height) {
     const [fx, fy, cx, cy] = this.lensOn(width, height), away = add(place, this.eye, -1), depth = dot(away, this.ahead);
     return depth > 1e-6 ? [cx + fx * dot(away, this.right) / depth, cy + fy * dot(away, this.down) / depth] : null;
@@ -50,7 +50,7 @@ class Camera {
   }
   approach(factor) { this.eye = add(this.target, add(this.eye, this.target, -1), factor); }
 
-  // By pixels of the canvas: what is at the target's distance follows the pointer.
+  // Pans by canvas pixels: points at the target's distance follow the pointer.
   slide(x, y, width, height) {
     const [fx, fy] = this.lensOn(width, height), depth = this.distance;
     const move = add(scaled(this.right, -x * depth / fx), this.down, -y * depth / fy);

@@ -1,9 +1,9 @@
-// What the pages of scenes and of images share.
+// Shared by the pages of scenes and of pictures.
 "use strict";
 
 const $ = id => document.getElementById(id);
 const middle = points => points.reduce((a, b) => [a[0] + b[0] / points.length, a[1] + b[1] / points.length], [0, 0]);
-const apart = ([a, b]) => b ? Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1])) : 1;
+const spacing = ([a, b]) => b ? Math.max(1, Math.hypot(a[0] - b[0], a[1] - b[1])) : 1;
 
 function keys(acts) {
   addEventListener("keydown", event => {

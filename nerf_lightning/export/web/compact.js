@@ -1,4 +1,4 @@
-// The compact file (runs/compact.py): a zip of .npy arrays and a header that says how each is coded.
+// Compact file (runs/compact.py): a zip of .npy arrays and a header with the coding of each.
 
 const NUMBERS = { "|b1": Uint8Array, "|u1": Uint8Array, "<f2": Uint16Array, "<f4": Float32Array, "<i4": Int32Array, "<i8": BigInt64Array };
 
@@ -55,7 +55,7 @@ class Compact {
     return bits;
   }
 
-  // Numbers as they are stored, and for each column what 0 and 1 of its texels stand for: bytes are textures of [0, 1].
+  // Stored numbers, and per column the range of its texels [0, 1]: bytes are normalized textures.
   stored(name) {
     const shape = this.shape(name), columns = shape.length > 1 ? shape[shape.length - 1] : 1, data = this.arrays[name];
     if (this.coded[name].code !== "byte") return { data, columns, low: new Float32Array(columns), span: new Float32Array(columns).fill(1) };
@@ -63,7 +63,7 @@ class Compact {
     return { data, columns, low, span: high.map((value, i) => value - low[i]) };
   }
 
-  // Any array as numbers.
+  // An array decoded to floats.
   floats(name) {
     const { data, columns, low, span } = this.stored(name);
     if (data instanceof Uint16Array) return Float32Array.from(data, fromHalf);

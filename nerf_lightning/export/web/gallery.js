@@ -1,4 +1,4 @@
-// What one page says of its camera, the others hear.
+// Forwards one page's camera messages to all others.
 "use strict";
 addEventListener("message", event => {
   if (event.data?.kind !== "nerf_lightning camera") return;

@@ -1,6 +1,6 @@
-// One ray a pixel, as sampler/occupancy.py and renderer/volumetric.py do it; names are theirs. The page puts #version and
-// constants before this: PLANES or VOXELS, UNBOUNDED, TERMS, ... and EACH_INPUT(F), which is F(0) F(1) ..., as loops over arrays are
-// slow without a graphics card. Places are in the unit cube, distances in world units.
+// Ray marching, one ray per pixel, with the algorithm and names of sampler/occupancy.py and renderer/renderer.py. The page prepends
+// #version and constants: PLANES or VOXELS, UNBOUNDED, TERMS, ... and EACH_INPUT(F), which is F(0) F(1) ..., as loops over arrays are
+// slow without a GPU. Positions are in the unit cube, distances in world units.
 precision highp float;
 precision highp int;
 precision highp sampler3D;
@@ -52,11 +52,11 @@ void seenAlong(vec3 d) {
 }
 
 #ifdef PLANES
-// Sums of planes times lines (kernels/planes.py). Layer m * groups + g holds channels 4g to 4g+3 of mode m; a channel coded as
-// bytes lies between `low` and `low + span`, which the filter may be asked for first, as both are linear.
+// Sums of planes times lines (kernels/vector_matrix.py). Layer m * groups + g holds channels 4g to 4g+3 of mode m; a channel coded
+// as bytes is mapped to [low, low + span] after filtering, as both are linear.
 uniform sampler2DArray densityPlanes, densityLines, colourPlanes, colourLines;
 uniform vec4 densityRanges[4 * DENSITY_GROUPS], colourRanges[4 * COLOUR_GROUPS];   // planes' low, span, lines' low, span
-const vec4 network[] = NETWORK;             // read by constant indices alone, so that the compiler sees numbers
+const vec4 network[] = NETWORK;             // constant indices only, so that the compiler inlines the weights
 const int INPUTS = 3 * COLOUR_GROUPS, STRIDE = 1 + TERMS + 4 * INPUTS + 3;         // vec4s for each four neurons
 
 vec3 inTexture(vec3 unit, float side) { return (clamp(unit, 0.0, 1.0) * (side - 1.0) + 0.5) / side; }
@@ -75,7 +75,7 @@ float rawDensity(vec3 unit) {
   return dot(total, vec4(1));
 }
 
-vec4 alongRay[NEURONS];                     // what bias and direction give each four neurons: the same all along the ray
+vec4 alongRay[NEURONS];                     // bias and direction terms of each four neurons: constant along the ray
 void prepare() {
 #define TERM(t) + harmonics[t] * network[first + 1 + t]
 #define ALONG(j) { const int first = j * STRIDE; alongRay[j] = network[first] EACH_TERM(TERM); }
@@ -101,9 +101,9 @@ vec3 colourAt(vec3 unit) {
   return sigmoid(logits);
 }
 #else
-// A sparse grid (kernels/voxels.py) as bricks of 8 x 8 x 8 vertices, of which neighbours share a side: the filter never leaves a
-// brick. Part 0 of the atlas holds log-density and colour, part 1 + b what harmonic 1 + b adds to red, green and blue.
-uniform usampler3D bricks;                  // where in the atlas each brick is; alpha 0: nowhere, nothing is kept there
+// A sparse voxel grid (kernels/voxels.py) as bricks of 8 x 8 x 8 vertices that share a side with their neighbours: filtering never
+// leaves a brick. Part 0 of the atlas holds log-density and colour, part 1 + b the coefficients of harmonic 1 + b.
+uniform usampler3D bricks;                  // position of each brick in the atlas; alpha 0: pruned
 uniform sampler3D atlas;
 uniform vec3 atlasSize;                     // texels
 uniform float partDepth;                    // texels along z from one part of the atlas to the next
@@ -127,7 +127,7 @@ float rawDensity(vec3 unit) {
 
 void prepare() {}
 
-vec3 colourAt(vec3 unit) {                  // where rawDensity was asked last
+vec3 colourAt(vec3 unit) {                  // at the position of the last rawDensity
   vec3 logits = firstColour;
   for (int b = 1; b <= TERMS; b++) logits += harmonics[b] * part(b).rgb;
   return sigmoid(logits);
@@ -146,7 +146,7 @@ vec3 unitOf(vec3 place) {                   // Bounds.to_unit
 }
 
 #ifdef UNBOUNDED
-float warp(float t, vec2 inside) {          // cameras/bounds.py: samples are even in what it gives
+float warp(float t, vec2 inside) {          // cameras/bounds.py: samples are even in warped distance
   float before = max((inside.x - t) / UNIT, 0.0), behind = max((t - inside.y) / UNIT, 0.0);
   return 1.0 / (1.0 + before) - 1.0 / (1.0 + behind) + (clamp(t, inside.x, inside.y) - inside.x) / UNIT;
 }
@@ -174,7 +174,7 @@ void main() {
   prepare();
 
   vec3 summed = vec3(0);
-  float light = 1.0, opacity = 0.0, reach = 0.0;          // light that still gets through: transmittance
+  float light = 1.0, opacity = 0.0, reach = 0.0;          // light: transmittance
   for (int k = 0; k <= SAMPLES; k++) {
 #ifdef UNBOUNDED
     float start = edge;
@@ -199,7 +199,7 @@ void main() {
     if (any(lessThan(unit, keepLow)) || any(greaterThan(unit, keepHigh))) continue;
     float through = exp(-density(rawDensity(unit)) * (end - start)), weight = light * (1.0 - through);
     if (weight > LEAST && shown == 0) summed += weight * colourAt(unit);
-    if (opacity < 0.5 && opacity + weight >= 0.5) reach = t;   // the median, as before a background
+    if (opacity < 0.5 && opacity + weight >= 0.5) reach = t;   // median depth, as for unbounded scenes
     opacity += weight;
     light *= through;
     if (light < STOP) break;

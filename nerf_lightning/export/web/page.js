@@ -1,10 +1,10 @@
-// The page: what a person's mouse, fingers and keys do, and what the controls show.
+// Page of a field: mouse, touch and keyboard input, and the controls.
 
 const about = JSON.parse($("about").textContent);
-const QUALITY = [[0.2, 6], [0.35, 12], [0.5, 20], [0.75, 30], [1, 45]];  // share of the screen's pixels at rest, milliseconds while moving
-const REST = 160, ROUND = 14000;            // milliseconds without a move before the fine picture, and of a turn of the turntable
-const QUICK = 40;                           // milliseconds for a picture with half of the screen's sides, below which the turntable starts by itself
-const CAMERA = "nerf_lightning camera";     // the kind of message by which pages side by side turn together
+const QUALITY = [[0.2, 6], [0.35, 12], [0.5, 20], [0.75, 30], [1, 45]];  // fraction of the screen's pixels at rest, milliseconds while moving
+const REST = 160, ROUND = 14000;            // milliseconds: idle time before the fine picture; one revolution of the turntable
+const QUICK = 40;                           // maximum milliseconds for a half-size picture at which the turntable starts automatically
+const CAMERA = "nerf_lightning camera";     // message kind that links the cameras of several pages
 
 function posesOf(text, lenses) {
   const rows = new Float32Array(fromBase64(text).buffer), poses = [];
@@ -31,7 +31,7 @@ class Page {
     this.resize();
   }
 
-  // Something changed: a coarse picture next, and a fine one when it rests.
+  // After a change: a coarse picture next, and a fine one at rest.
   changed(by = "touch") {
     this.moved = performance.now();
     this.dirty = true;
@@ -63,7 +63,7 @@ class Page {
       this.canvas.dataset.drawn = "fine";
       this.resting?.();
       this.resting = this.last = null;
-      return;                               // nothing happens until something changes
+      return;                               // idle until the next change
     }
     this.wake();
   }
@@ -92,7 +92,7 @@ class Page {
     if (on) this.changed("turntable");
   }
 
-  // As measured while the last pictures were drawn.
+  // Measured while drawing the last pictures.
   get quick() { return this.renderer.perPixel * this.canvas.width * this.canvas.height / 4 < QUICK; }
 
   resize() {
@@ -107,7 +107,7 @@ class Page {
     return [(event.clientX - box.left) * this.canvas.width / box.width, (event.clientY - box.top) * this.canvas.height / box.height];
   }
 
-  // Mouse, pen and fingers: one turns, two or the right button move and come closer.
+  // Mouse, pen and touch: one pointer turns; two, or the right button, pan and zoom.
   hold() {
     const { canvas } = this, down = new Map();
     canvas.addEventListener("pointerdown", event => {
@@ -120,7 +120,7 @@ class Page {
       const before = [...down.values()];
       down.set(event.pointerId, this.at(event));
       const after = [...down.values()], [x, y] = add([...middle(after), 0], [...middle(before), 0], -1), { width, height } = canvas;
-      if (after.length > 1) this.camera.approach(Math.min(2, Math.max(0.5, apart(before) / apart(after))));
+      if (after.length > 1) this.camera.approach(Math.min(2, Math.max(0.5, spacing(before) / spacing(after))));
       if (after.length > 1 || event.buttons & 2 || event.shiftKey) this.camera.slide(x, y, width, height);
       else this.camera.turn(-x / Math.min(width, height) * 3, -y / Math.min(width, height) * 3, this.up);
       hideHint();
@@ -211,7 +211,7 @@ class Page {
     });
   }
 
-  // For other programs, and pages side by side: looks through a camera, on a canvas of a size if one is given.
+  // For other programs and linked pages: sets the camera, and the canvas size if given.
   show({ rows, lens }, size) {
     this.changed();
     if (size) this.fixed = size;

@@ -1,7 +1,7 @@
-// A picture's page: drag it, come closer.
+// Page of a picture: pan and zoom.
 
 const view = $("view"), picture = $("picture"), held = new Map();
-let place = [0, 0, 1];                      // of the picture's upper left corner, and its size, pixels of the screen
+let place = [0, 0, 1];                      // upper left corner of the picture (screen pixels) and scale
 
 function put(x, y, scale) {
   place = [x, y, scale];
@@ -26,7 +26,7 @@ view.addEventListener("pointermove", event => {
   held.set(event.pointerId, [event.clientX, event.clientY]);
   const after = [...held.values()], [was, is] = [before, after].map(middle);
   put(place[0] + is[0] - was[0], place[1] + is[1] - was[1], place[2]);
-  if (after.length > 1) closer(apart(after) / apart(before), ...is);
+  if (after.length > 1) closer(spacing(after) / spacing(before), ...is);
   hideHint();
 });
 for (const name of ["pointerup", "pointercancel"]) view.addEventListener(name, event => held.delete(event.pointerId));

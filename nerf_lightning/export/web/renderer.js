@@ -10,12 +10,12 @@ class Renderer {
     this.gl = canvas.getContext("webgl2", { alpha: true, antialias: false, depth: false, powerPreference: "high-performance" });
     if (!this.gl) throw new Error("This page needs WebGL 2, which this browser does not offer or has switched off.");
     this.look = { shown: 0, background: [...about.background, 1], keep: [0, 0, 0, 1, 1, 1] };
-    this.perPixel = 5e-2;                   // milliseconds, as measured last; a guess at first, for a slow machine
-    this.rows = 0;                          // of the fine picture that are done
+    this.perPixel = 5e-2;                   // milliseconds, last measurement; initially a guess for a slow machine
+    this.rows = 0;                          // finished rows of the fine picture
     this.prepare();
   }
 
-  // Everything that is lost with the context.
+  // GPU resources, lost with the context.
   prepare() {
     const { gl, about } = this, field = (about.kind === "planes" ? planesOf : voxelsOf)(gl, this.compact, about);
     const { bounds, sampler } = about, vec3 = row => `vec3(${row.map(number)})`;
@@ -39,7 +39,7 @@ class Renderer {
       gl.uniform3fv(this.place("atlasSize"), field.atlasSize);
       gl.uniform1f(this.place("partDepth"), field.partDepth);
     }
-    gl.activeTexture(gl.TEXTURE0 + Object.keys(textures).length);  // pictures are made in a unit of their own
+    gl.activeTexture(gl.TEXTURE0 + Object.keys(textures).length);  // separate texture unit for render targets
     this.coarse = this.fine = null;
   }
 
@@ -69,7 +69,7 @@ class Renderer {
     return { frame, texture, width, height };
   }
 
-  // Renders some rows of a picture, counted from its lower edge, and measures the time.
+  // Renders rows of a picture, counted from its lower edge, and measures the time.
   march(camera, picture, low, high, shown = this.look.shown) {
     const { gl, about, look } = this, [across, down, ahead] = camera.axes(picture.width, picture.height), began = performance.now();
     gl.bindFramebuffer(gl.FRAMEBUFFER, picture.frame);
@@ -96,14 +96,14 @@ class Renderer {
   draw(camera, milliseconds, share) {
     const { width, height } = this.canvas;
     const part = Math.min(share, Math.max(0.08, Math.sqrt(milliseconds / (this.perPixel * width * height))));
-    const side = length => Math.max(1, Math.round(length * Math.ceil(part * 12) / 12));  // few sizes, so that few are made
+    const side = length => Math.max(1, Math.round(length * Math.ceil(part * 12) / 12));  // few sizes, to reuse render targets
     this.coarse = this.picture(this.coarse, side(width), side(height));
     this.march(camera, this.coarse, 0, this.coarse.height);
     this.rows = 0;
     this.present();
   }
 
-  // The next band of the picture at rest; false when it is whole.
+  // Renders the next band of the picture at rest; false when it is complete.
   refine(camera, share) {
     const width = Math.max(1, Math.round(this.canvas.width * share)), height = Math.max(1, Math.round(this.canvas.height * share));
     this.fine = this.picture(this.fine, width, height);
@@ -127,7 +127,7 @@ class Renderer {
     if (rows) copy(fine, rows);
   }
 
-  // The place that a pixel of the canvas shows, or null where it shows nothing.
+  // Surface point at a canvas pixel, or null where there is none.
   placeAt(camera, x, y) {
     const { canvas } = this, [across, down, ahead] = camera.axes(canvas.width, canvas.height);
     const direction = unitLength(add(add(ahead, across, x), down, y)), one = this.picture(null, 1, 1);

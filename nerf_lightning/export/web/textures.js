@@ -20,9 +20,9 @@ function makeTexture(gl, target, type, [width, height, depth], data, linear) {
 const each = (name, count) => ({ [`EACH_${name}(F)`]: Array.from({ length: count }, (_, i) => `F(${i})`).join(" ") });
 const typeOf = data => data instanceof Uint8Array ? "bytes" : "halves";
 
-// What march.glsl calls gaps: by two passes over all 26 neighbours (Rosenfeld and Pfaltz 1968), exact for this distance.
+// Chebyshev distance transform (gaps of march.glsl): two passes over the 26 neighbours (Rosenfeld and Pfaltz 1968), exact.
 function gapsOf(occupied, side) {
-  const wide = side + 2, gaps = new Uint8Array(wide ** 3).fill(255), before = [];   // with a margin, so that all have neighbours
+  const wide = side + 2, gaps = new Uint8Array(wide ** 3).fill(255), before = [];   // with a margin
   const cells = new Int32Array(side ** 3), found = new Uint8Array(side ** 3);
   for (let x = 1, i = 0; x <= side; x++) for (let y = 1; y <= side; y++) for (let z = 1; z <= side; z++, i++) {
     cells[i] = (x * wide + y) * wide + z;
@@ -40,7 +40,7 @@ function gapsOf(occupied, side) {
   return found;
 }
 
-// Planes or lines [3, places, C] as layers of four channels, and what their texels stand for.
+// Planes or lines [3, vertices, C] as layers of four channels, and the ranges of their texels.
 function layersOf(gl, compact, name, width, height) {
   const { data, columns, low, span } = compact.stored(name), groups = Math.ceil(columns / 4), places = width * height;
   const texels = new data.constructor(3 * groups * places * 4);
@@ -99,7 +99,7 @@ function voxelsOf(gl, compact, about) {
     each((i, j, k) => { any |= vertex(x * BRICK + i, y * BRICK + j, z * BRICK + k); });
     if (any) used.push([x, y, z]);
   }
-  // Bricks stand in layers of `across` squared, one part of the atlas above the other.
+  // Bricks fill layers of `across` squared; the parts of the atlas are stacked.
   const size = BRICK + 1, across = Math.max(1, Math.ceil(Math.cbrt(used.length * (1 + terms)))), deep = Math.max(1, Math.ceil(used.length / across ** 2));
   const shape = [across * size, across * size, deep * size * (1 + terms)];
   if (Math.max(...shape) > gl.getParameter(gl.MAX_3D_TEXTURE_SIZE)) throw new Error("This field is too large for this device's graphics.");

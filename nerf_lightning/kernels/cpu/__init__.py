@@ -1,7 +1,7 @@
-"""Fast versions for CPUs, compiled by numba on first use and cached on disk; the modules one level up say what each does.
+"""Fast CPU kernels, compiled by numba on first use and cached on disk; `nerf_lightning.kernels` documents each.
 
-Here features and coordinates come first and samples last ([F, N]), so that loops over samples are long and contiguous.
-Work is split by the number of threads alone, never at random or by load: the same seed and threads give the same bits.
+Samples are the last axis ([F, N]), so that loops over samples are long and contiguous. Work is split by the number of threads
+alone, not by load: the same seed and number of threads give the same bits.
 """
 
 from importlib import import_module
@@ -9,7 +9,7 @@ from types import ModuleType
 
 
 def __getattr__(name: str) -> ModuleType:
-    """Imports a module when it is first used: where no fast version runs, nobody waits for numba."""
+    """Imports kernels lazily, so that numba loads only if a fast version runs."""
     if name.startswith("_"):
         raise AttributeError(name)
     return import_module(f"{__name__}.{name}")

@@ -1,4 +1,4 @@
-"""Emission-absorption rendering, ray after ray, and its gradient."""
+"""Compositing along rays and its gradient; visibility filtering and early termination."""
 
 import math
 
@@ -9,10 +9,10 @@ from nerf_lightning.kernels.cpu.jit import kernel
 
 @kernel
 def forward(density, rgb, t, dt, offsets, colour, opacity, depth, transmittance):
-    """Fills the sums over each ray, colour [3, R], opacity [R], depth [R], and the transmittance before each sample [N]."""
+    """Fills colour [3, R], opacity [R], depth [R], and the transmittance before each sample [N]."""
     for ray in prange(len(offsets) - 1):
-        optical = 0.0  # in double: the sum over a ray outgrows single precision
-        red, green, blue, covered, distance = 0.0, 0.0, 0.0, 0.0, 0.0
+        optical = 0.0  # float64: sums over a ray exceed float32 precision
+        red, green, blue, alpha, distance = 0.0, 0.0, 0.0, 0.0, 0.0
         for n in range(offsets[ray], offsets[ray + 1]):
             through = math.exp(-optical)
             step = density[n] * dt[n]
@@ -22,10 +22,10 @@ def forward(density, rgb, t, dt, offsets, colour, opacity, depth, transmittance)
             red += weight * rgb[0, n]
             green += weight * rgb[1, n]
             blue += weight * rgb[2, n]
-            covered += weight
+            alpha += weight
             distance += weight * t[n]
         colour[0, ray], colour[1, ray], colour[2, ray] = red, green, blue
-        opacity[ray], depth[ray] = covered, distance
+        opacity[ray], depth[ray] = alpha, distance
 
 
 @kernel
@@ -34,7 +34,7 @@ def backward(
 ):
     """Gradients of density [N] and rgb [3, N] from those of colour [3, R], opacity [R] and depth [R].
 
-    With g_i the gradient of weight w_i:  d/d density_i = dt_i (T_{i+1} g_i - sum_{j > i} w_j g_j), taken from the far end.
+    With g_i the gradient of weight w_i:  d/d density_i = dt_i (T_{i+1} g_i - sum_{j > i} w_j g_j), computed back to front.
     """
     for ray in prange(len(offsets) - 1):
         red, green, blue = grad_colour[0, ray], grad_colour[1, ray], grad_colour[2, ray]
@@ -52,22 +52,16 @@ def backward(
 
 @kernel
 def mark_visible(optical_depth, offsets, early_stop_eps, min_optical_depth, max_dropped, keep, counts):
-    """Marks samples that light can reach and that hold something, and counts them for each ray [R].
-
-    Args:
-        early_stop_eps: early-stop transmittance: below it a ray has ended.
-        min_thickness: alpha threshold, as an optical thickness: a sample below it holds nothing.
-        dropped: optical thickness that those of a ray may have together; the later ones stay.
-    """
-    furthest = -math.log(early_stop_eps)
+    """Marks visible samples (neither occluded nor transparent), and counts them per ray [R]; see `filter_visible`."""
+    max_depth = -math.log(early_stop_eps)
     for ray in prange(len(offsets) - 1):
         optical, thin, kept = 0.0, 0.0, 0
         for n in range(offsets[ray], offsets[ray + 1]):
             step = optical_depth[n]
-            nothing = step < min_optical_depth  # NaN stays, to be noticed
-            if nothing:
+            is_transparent = step < min_optical_depth  # NaN stays and propagates
+            if is_transparent:
                 thin += step
-            keep[n] = not (optical > furthest or (nothing and thin <= max_dropped))
+            keep[n] = not (optical > max_depth or (is_transparent and thin <= max_dropped))
             kept += keep[n]
             optical += step
         counts[ray] = kept
@@ -75,7 +69,7 @@ def mark_visible(optical_depth, offsets, early_stop_eps, min_optical_depth, max_
 
 @kernel
 def pack_visible(keep, offsets, kept_offsets, optical_depth, t, dt, out, out_ray):
-    """Packs the kept samples: their thickness, t and dt into out [3, K]."""
+    """Packs optical depth, t and dt of the kept samples into out [3, K]."""
     for ray in prange(len(offsets) - 1):
         to = kept_offsets[ray]
         for n in range(offsets[ray], offsets[ray + 1]):
@@ -85,25 +79,25 @@ def pack_visible(keep, offsets, kept_offsets, optical_depth, t, dt, out, out_ray
 
 
 @kernel
-def accumulate_optical_depth(optical_depth, offsets, rays, furthest, max_intervals, optical, active):
-    """Adds up in `optical` [R] what some rays have met, and says which of these go on [A].
+def accumulate_optical_depth(optical_depth, offsets, rays, max_depth, max_intervals, optical, active):
+    """Accumulates the optical depth [R] of rays [A] and marks those that continue.
 
     Args:
-        which: [A], the rays.
-        furthest: optical thickness behind which light does not reach.
-        most: a ray with fewer new samples has no more.
+        rays: [A], indices of the rays.
+        max_depth: optical depth at which a ray ends.
+        max_intervals: a ray with fewer new samples has no more.
     """
     for n in prange(len(rays)):
-        met = optical[rays[n]]
+        total = optical[rays[n]]
         for m in range(offsets[n], offsets[n + 1]):
-            met += optical_depth[m]
-        optical[rays[n]] = met
-        active[n] = offsets[n + 1] - offsets[n] == max_intervals and not met > furthest
+            total += optical_depth[m]
+        optical[rays[n]] = total
+        active[n] = offsets[n + 1] - offsets[n] == max_intervals and not total > max_depth
 
 
 @kernel
 def append_samples(rays, offsets, optical_depth, t, dt, at, out_optical_depth, out_t, out_dt, out_ray):
-    """Writes some rays' [A] samples to where these rays' next ones belong, at [R], which moves on."""
+    """Appends samples of rays [A] to the packed output at each ray's write position `at` [R], which is advanced."""
     for n in prange(len(rays)):
         ray = rays[n]
         to = at[ray]

@@ -12,7 +12,7 @@ C3D, C3E = float32(0.3731763325901154), float32(1.445305721320277)
 
 @kernel
 def evaluate(directions, out):
-    """out [16, N] from unit directions [N, 3]."""
+    """Fills out [16, N] for unit directions [N, 3]."""
     one, three, five = float32(1), float32(3), float32(5)
     for n in prange(len(directions)):
         x, y, z = directions[n, 0], directions[n, 1], directions[n, 2]

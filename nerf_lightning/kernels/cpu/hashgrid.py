@@ -1,6 +1,6 @@
-"""Hash-grid interpolation and its gradient in two or three dimensions, level by level: one level's table fits a core's cache.
+"""Hash-grid interpolation and its gradient in 2D and 3D, level by level: one level's table fits a core's cache.
 
-`axes` and `features` are tuples whose lengths, the dimensions and the numbers in an entry, are known when compiling.
+`axes` and `features` are tuples whose lengths are compile-time constants: dimensions and features per entry.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Instant-NGP, e
 
 @jit(inline="always")
 def cell_of(x, resolution):
-    """Lower corner and fraction of one coordinate in [0, 1]; clamped outside. NaN stays NaN, in some cell."""
+    """Lower vertex and fraction of a coordinate, clamped to [0, 1]. NaN falls in an arbitrary cell with fraction NaN."""
     scaled = min(max(x, float32(0)), float32(1)) * float32(resolution)
     cell = int32(min(uint32(int32(scaled)), uint32(resolution - 1)))
     return uint32(cell), scaled - float32(cell)
@@ -21,7 +21,7 @@ def cell_of(x, resolution):
 
 @jit(inline="always")
 def combine_corners_2d(x, y, side, dense):
-    """What two coordinates contribute to the numbers of the four corners' entries, the second coordinate fastest."""
+    """Partial entry indices of the four corners from two coordinates, the second coordinate fastest."""
     if dense:
         first = x + y * side
         return first, first + side, first + uint32(1), first + side + uint32(1)
@@ -32,7 +32,7 @@ def combine_corners_2d(x, y, side, dense):
 
 @jit(forceinline=True)
 def corners(unit, n, cells, entries, axes):
-    """Entries and weights of the corners around place n, the last coordinate fastest; row-major where they fit, else hashed."""
+    """Entries and weights of the corners around position n, last coordinate fastest; row-major where dense, else hashed."""
     x, fx = cell_of(unit[0, n], cells[0])
     y, fy = cell_of(unit[1, n], cells[1])
     gx, gy, side, mask = float32(1) - fx, float32(1) - fy, uint32(cells[0] + 1), uint32(entries - 1)
@@ -63,7 +63,7 @@ def corners(unit, n, cells, entries, axes):
 
 @jit(forceinline=True)
 def cells_of(resolutions, level, axes):
-    """A level's cells along each axis, as numbers that stay in registers."""
+    """A level's cells along each axis, as scalars that stay in registers."""
     return resolutions[level, 0], resolutions[level, 1], resolutions[level, len(axes) - 1]
 
 
@@ -82,7 +82,7 @@ def interpolate_level(table, unit, first, last, cells, out, axes, features):
 
 @jit
 def scatter_level(grad, unit, cells, grad_output, axes, features):
-    """Adds the gradient of one level's features, `grad_output` [F, N], to the gradient of its table."""
+    """Accumulates the gradient of a level's table from `grad_output` [F, N]."""
     for n in range(unit.shape[1]):
         i, w = corners(unit, n, cells, len(grad), axes)
         for f in range(len(features)):
@@ -93,7 +93,7 @@ def scatter_level(grad, unit, cells, grad_output, axes, features):
 
 @jit(inline="always")
 def dot_grad_output(table, row, grad_output, n, features):
-    """How the loss changes with how much of an entry place n reads."""
+    """Gradient in the weight of an entry at position n."""
     value = float32(0)
     for f in range(len(features)):
         value += grad_output[f, n] * table[row, f]
@@ -102,13 +102,13 @@ def dot_grad_output(table, row, grad_output, n, features):
 
 @jit(inline="always")
 def cells_per_unit(x, resolution):
-    """How many cells a coordinate passes per unit: none where it is clamped."""
+    """Derivative of the grid coordinate; 0 where it is clamped."""
     return float32(resolution) if float32(0) <= x <= float32(1) else float32(0)
 
 
 @jit(inline="always")
 def trilinear_gradient(v, fx, fy, fz):
-    """How the mean of the values at a cell's corners changes along each axis, per cell."""
+    """Gradient of trilinear interpolation of corner values along each axis, per cell."""
     gx, gy, gz = float32(1) - fx, float32(1) - fy, float32(1) - fz
     return (
         gy * (gz * (v[4] - v[0]) + fz * (v[5] - v[1])) + fy * (gz * (v[6] - v[2]) + fz * (v[7] - v[3])),
@@ -119,31 +119,23 @@ def trilinear_gradient(v, fx, fy, fz):
 
 @jit
 def position_gradient_level(table, unit, first, last, cells, grad_output, grad, axes, features):
-    """Adds to grad[:, first:last] the gradient in the places that one level's features, `grad_output` [F, N], give."""
+    """Accumulates in grad[:, first:last] the gradient in the positions from a level's `grad_output` [F, N]."""
     for n in range(first, last):
         i, w = corners(unit, n, cells, len(table), axes)
         x, fx = cell_of(unit[0, n], cells[0])
         y, fy = cell_of(unit[1, n], cells[1])
-        a, b = (
-            dot_grad_output(table, i[0], grad_output, n, features),
-            dot_grad_output(table, i[1], grad_output, n, features),
-        )
-        c, d = (
-            dot_grad_output(table, i[2], grad_output, n, features),
-            dot_grad_output(table, i[3], grad_output, n, features),
-        )
+        a = dot_grad_output(table, i[0], grad_output, n, features)
+        b = dot_grad_output(table, i[1], grad_output, n, features)
+        c = dot_grad_output(table, i[2], grad_output, n, features)
+        d = dot_grad_output(table, i[3], grad_output, n, features)
         if len(axes) == 2:
             gx, gy = float32(1) - fx, float32(1) - fy
             dx, dy = gy * (c - a) + fy * (d - b), gx * (b - a) + fx * (d - c)
         else:
-            e, f = (
-                dot_grad_output(table, i[4], grad_output, n, features),
-                dot_grad_output(table, i[5], grad_output, n, features),
-            )
-            g, h = (
-                dot_grad_output(table, i[6], grad_output, n, features),
-                dot_grad_output(table, i[7], grad_output, n, features),
-            )
+            e = dot_grad_output(table, i[4], grad_output, n, features)
+            f = dot_grad_output(table, i[5], grad_output, n, features)
+            g = dot_grad_output(table, i[6], grad_output, n, features)
+            h = dot_grad_output(table, i[7], grad_output, n, features)
             z, fz = cell_of(unit[2, n], cells[2])
             dx, dy, dz = trilinear_gradient((a, b, c, d, e, f, g, h), fx, fy, fz)
             grad[2, n] += cells_per_unit(unit[2, n], cells[2]) * dz
@@ -153,17 +145,17 @@ def position_gradient_level(table, unit, first, last, cells, grad_output, grad, 
 
 @kernel
 def interpolate(tables, unit, resolutions, sizes, out, axes, features, workers):
-    """out [LF, N] from tables [T, F], unit [D, N] and resolutions [L, D]. A level belongs to one worker, so that its table
-    stays in that core's cache; levels that do not go round are shared in equal stretches."""
+    """Fills out [LF, N] from tables [T, F], unit [D, N] and resolutions [L, D]. Each worker owns whole levels, so that tables
+    stay in its core's cache; remaining levels are split evenly."""
     samples, levels, width = unit.shape[1], len(resolutions), len(features)
-    whole = levels - levels % workers
+    owned = levels - levels % workers
     for worker in prange(workers):
-        stretch = samples * (levels - whole)
-        begin, end, start = stretch * worker // workers, stretch * (worker + 1) // workers, 0
+        split_samples = samples * (levels - owned)
+        begin, end, start = split_samples * worker // workers, split_samples * (worker + 1) // workers, 0
         for level in range(levels):
-            passed = samples * (level - whole)
+            passed = samples * (level - owned)
             first, last = max(begin - passed, 0), min(end - passed, samples)
-            if level < whole:
+            if level < owned:
                 first, last = 0, samples if level % workers == worker else 0
             if first < last:
                 table, cells = tables[start : start + sizes[level]], cells_of(resolutions, level, axes)
@@ -174,7 +166,7 @@ def interpolate(tables, unit, resolutions, sizes, out, axes, features, workers):
 
 @kernel
 def scatter(grad, unit, resolutions, sizes, grad_output, axes, features, workers):
-    """Fills grad [T, F]. A level belongs to one worker, so no two add to the same entry."""
+    """Fills grad [T, F]. Each level belongs to one worker, which avoids races."""
     levels, width = len(resolutions), len(features)
     for worker in prange(workers):
         start = 0
@@ -188,7 +180,7 @@ def scatter(grad, unit, resolutions, sizes, grad_output, axes, features, workers
 
 @kernel
 def position_gradient(tables, unit, resolutions, sizes, grad_output, grad, axes, features, workers):
-    """Fills grad [D, N], the gradient in the places."""
+    """Fills grad [D, N], the gradient in the positions."""
     samples, width = unit.shape[1], len(features)
     for worker in prange(workers):
         first, last, start = samples * worker // workers, samples * (worker + 1) // workers, 0

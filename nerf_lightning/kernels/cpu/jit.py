@@ -1,4 +1,4 @@
-"""How the CPU kernels are compiled."""
+"""Compilation of the CPU kernels."""
 
 import functools
 import inspect
@@ -8,36 +8,35 @@ from collections.abc import Callable
 import numba
 import torch
 
-# No fast maths. Numba optimises a function again for every other one it is linked into, and a process that compiles a kernel
-# runs another copy than one that loads it from the cache: where the optimiser may reorder or fuse, their last bits differ.
-# Vector code is written out instead: see `lanes`.
+# No fastmath: numba optimizes a function again in every caller, and compiled and cached copies would differ in the last bits
+# where the optimizer may reorder or fuse. Vector code is explicit instead, see `simd`.
 jit = functools.partial(numba.njit, cache=True, error_model="numpy")
-"""Decorates functions that kernels call."""
+"""Decorator of functions called by kernels."""
 
 
 def kernel(function: Callable) -> Callable:
-    """Decorates an entry point: it takes tensors, as contiguous arrays, and runs on as many threads as torch.
+    """Decorator of kernel entry points: passes tensors as contiguous arrays and uses torch's number of threads.
 
-    What it fills has to be contiguous already: of any other tensor it would fill a copy. An argument `workers`, the last, is
-    not given by callers: it is the number of pieces that the work is to be split into.
+    Outputs must be contiguous: otherwise a copy would be filled. The decorator appends the last argument, `workers`, if the
+    kernel has one: the number of parallel chunks.
     """
     compiled, takes_workers = jit(function, parallel=True), "workers" in inspect.signature(function).parameters
 
     @functools.wraps(function)
     def run(*arguments):
-        # A step makes some forty calls of up to thirty arguments, so each conversion that is not needed shows.
-        given = [
+        # A step makes about forty calls of up to thirty arguments: avoid needless conversions.
+        arrays = [
             (x.detach() if x.requires_grad else x).contiguous().numpy() if isinstance(x, torch.Tensor) else x
             for x in arguments
         ]
         pieces = sync_num_threads()
-        compiled(*given, pieces) if takes_workers else compiled(*given)
+        compiled(*arrays, pieces) if takes_workers else compiled(*arrays)
 
     return run
 
 
 class _Threads(threading.local):
-    """What numba was told last: it keeps a number of threads for each thread, behind a lock."""
+    """Cache of the thread counts: numba keeps one per thread, behind a lock."""
 
     torch = numba = 0
 
@@ -46,11 +45,11 @@ _threads = _Threads()
 
 
 def sync_num_threads() -> int:
-    """Sets numba's number of threads to torch's, and returns it."""
-    asked = torch.get_num_threads()
-    if asked != _threads.torch:
-        _threads.torch, _threads.numba = asked, min(asked, numba.config.NUMBA_NUM_THREADS)
+    """Sets numba's number of threads to torch's and returns it."""
+    num_threads = torch.get_num_threads()
+    if num_threads != _threads.torch:
+        _threads.torch, _threads.numba = num_threads, min(num_threads, numba.config.NUMBA_NUM_THREADS)
         numba.set_num_threads(_threads.numba)
-        if torch.get_num_threads() != asked:  # both use OpenMP, and numba's start gives torch all cores too
-            torch.set_num_threads(asked)
+        if torch.get_num_threads() != num_threads:  # starting numba's OpenMP resets torch's count
+            torch.set_num_threads(num_threads)
     return _threads.numba

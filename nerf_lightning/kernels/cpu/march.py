@@ -1,7 +1,4 @@
-"""Walking rays through an occupancy grid.
-
-Distances, positions and cells are rounded exactly as the torch reference rounds them, so both keep the same samples.
-"""
+"""Ray marching through an occupancy grid, rounded exactly as the torch reference, so that both keep the same samples."""
 
 import numpy as np
 from numba import float32, int32, prange, uint8
@@ -9,14 +6,14 @@ from numba import float32, int32, prange, uint8
 from nerf_lightning.kernels.cpu.jit import jit, kernel
 
 MAX_BLOCK_DISTANCE = 8
-"""Most blocks that a leap looks ahead."""
+"""Maximum block distance, which bounds a leap."""
 ROUNDING_ERROR = float32(1e-6)
-"""Share by which places and distances may differ from the reference's: some roundings to single precision."""
+"""Bound of the relative rounding error of positions and distances in float32."""
 
 
 @jit
 def warp(t, enter, leave, unit):
-    """Numbers in which an unbounded ray's steps are even; see `nerf_lightning.cameras.bounds.warp`."""
+    """Warped distance in which an unbounded ray's steps are even; see `nerf_lightning.cameras.bounds.warp`."""
     one, zero = float32(1), float32(0)
     near_distance, far_distance = max((enter - t) / unit, zero), max((t - leave) / unit, zero)
     inside_distance = (min(max(t, enter), leave) - enter) / unit
@@ -25,19 +22,19 @@ def warp(t, enter, leave, unit):
 
 @jit
 def unwarp(y, enter, leave, unit):
-    """The inverse of `warp`."""
-    one, zero, most = float32(1), float32(0), float32(1 - 1e-6)
+    """Inverse of `warp`."""
+    one, zero, limit = float32(1), float32(0), float32(1 - 1e-6)
     length = (leave - enter) / unit
     if y < zero:
-        return enter - unit * (one / (one + max(y, -most)) - one)
+        return enter - unit * (one / (one + max(y, -limit)) - one)
     if y > length:
-        return leave + unit * (one / (one - min(y - length, most)) - one)
+        return leave + unit * (one / (one - min(y - length, limit)) - one)
     return enter + unit * y
 
 
 @jit(forceinline=True)
 def ray_span(near, far, inside, ray, half, unbounded):
-    """What `interval_start` needs to know of a ray: where it begins and ends, and of an unbounded one its warped distances."""
+    """Near and far distance of a ray, and for an unbounded one its warped distances, for `interval_start`."""
     first, last, unit = near[ray], max(far[ray], near[ray]), max(half[0], max(half[1], half[2]))
     enter, leave, low, length = float32(0), float32(0), float32(0), float32(0)
     if unbounded:
@@ -85,40 +82,38 @@ def cell_coordinate(u, resolution):
 
 @jit
 def cell_number(u, v, w, resolution):
-    """Number of the cell of a cubic grid that holds a place in the unit cube."""
-    return (
-        cell_coordinate(u, resolution) * resolution + cell_coordinate(v, resolution)
-    ) * resolution + cell_coordinate(w, resolution)
+    """Flat index of the cell of a cubic grid at a position in the unit cube."""
+    i, j, k = cell_coordinate(u, resolution), cell_coordinate(v, resolution), cell_coordinate(w, resolution)
+    return (i * resolution + j) * resolution + k
 
 
 @jit(inline="always")
 def axis_traversal(origin, direction, middle, half, cells):
-    """Of a ray along one axis: where it starts, in cells of a grid over the box, how far it goes for one of them, and how far
-    while rounding may leave open which one it is in."""
+    """Traversal of a grid along one axis: start in cells, distance per cell, and rounding tolerance as a distance."""
     scale = float32(cells) / (float32(2) * half)
     speed = direction * scale
-    start, a_cell = (origin - (middle - half)) * scale, (float32(1) / speed if speed != float32(0) else float32(1e30))
-    return start, a_cell, ROUNDING_ERROR * (abs(start) + float32(cells)) * abs(a_cell)
+    start, per_cell = (origin - (middle - half)) * scale, (float32(1) / speed if speed != float32(0) else float32(1e30))
+    return start, per_cell, ROUNDING_ERROR * (abs(start) + float32(cells)) * abs(per_cell)
 
 
 @jit(inline="always")
 def safe_distance(u, cells, empty_blocks, axis):
-    """Distance up to which a ray is surely in cells nearer than the `empty_blocks`-th from that at u along an axis."""
-    start, a_cell, unsure = axis
-    wall = cell_coordinate(u, cells) + (empty_blocks if a_cell > float32(0) else 1 - empty_blocks)
-    return (float32(wall) - start) * a_cell - unsure
+    """Conservative distance along one axis before the ray leaves the `empty_blocks` known-empty cells around u."""
+    start, per_cell, tolerance = axis
+    wall = cell_coordinate(u, cells) + (empty_blocks if per_cell > float32(0) else 1 - empty_blocks)
+    return (float32(wall) - start) * per_cell - tolerance
 
 
 @kernel
 def march(rays, origins, directions, near, far, inside, shift, occupied, resolution, blocks, cells, centre, half, unbounded,
          samples, step, max_intervals, next_interval, intervals, counts):  # fmt: skip
-    """Writes the next intervals to keep of some rays [A] into intervals [A, max_intervals], and how many into counts [A].
+    """Marches rays [A] on: fills intervals [A, max_intervals] with the next occupied intervals and counts [A].
 
     Args:
-        rays: [A], the rays.
-        occupied: [resolution^3], row by row.
-        blocks: [cells^3], from `compute_block_distances`: empty ones are crossed in leaps.
-        next_interval: [R], where each ray goes on: at this interval. Moved on.
+        rays: [A], indices of the rays.
+        occupied: [resolution^3], row-major.
+        blocks: [cells^3], from `compute_block_distances`, to skip empty space.
+        next_interval: [R], interval at which each ray continues; advanced.
     """
     for n in prange(len(rays)):
         ray = rays[n]
@@ -126,7 +121,7 @@ def march(rays, origins, directions, near, far, inside, shift, occupied, resolut
         across = axis_traversal(origins[ray, 0], directions[ray, 0], centre[0], half[0], cells)
         down = axis_traversal(origins[ray, 1], directions[ray, 1], centre[1], half[1], cells)
         deep = axis_traversal(origins[ray, 2], directions[ray, 2], centre[2], half[2], cells)
-        unsure = float32(0.01) + ROUNDING_ERROR * span[1] / step  # steps by which a distance may be wrong
+        tolerance = float32(0.01) + ROUNDING_ERROR * span[1] / step  # in steps
         start = interval_start(k, shift[ray], span, step, samples, unbounded)
         while k <= samples and kept < max_intervals:
             end = interval_start(k + 1, shift[ray], span, step, samples, unbounded)
@@ -141,11 +136,10 @@ def march(rays, origins, directions, near, far, inside, shift, occupied, resolut
             empty_blocks = int(blocks[cell_number(u, v, w, cells)])
             if empty_blocks > 0:
                 if not unbounded:
-                    first = min(
-                        safe_distance(u, cells, empty_blocks, across), safe_distance(v, cells, empty_blocks, down)
-                    )
+                    first = safe_distance(u, cells, empty_blocks, across)
+                    first = min(first, safe_distance(v, cells, empty_blocks, down))
                     first = min(first, safe_distance(w, cells, empty_blocks, deep))
-                    leap = int((first - t) / step - unsure)
+                    leap = int((first - t) / step - tolerance)
                     if leap > 0:
                         k += leap
                         end = interval_start(k + 1, shift[ray], span, step, samples, unbounded)
@@ -158,7 +152,7 @@ def march(rays, origins, directions, near, far, inside, shift, occupied, resolut
 
 @kernel
 def pack_steps(rays, near, far, inside, shift, half, unbounded, samples, step, intervals, offsets, t, dt, ray_of):
-    """Distances and lengths of the intervals that `march` found, one ray after the other."""
+    """Fills midpoint distance, length and ray of the intervals of `march`, packed by ray."""
     for n in prange(len(rays)):
         ray = rays[n]
         span = ray_span(near, far, inside, ray, half, unbounded)
@@ -171,7 +165,7 @@ def pack_steps(rays, near, far, inside, shift, half, unbounded, samples, step, i
 
 @kernel
 def compute_block_distances(blocks):
-    """Replaces blocks [n, n, n] by their Chebyshev distances to the nearest 0, at most `MAX_BLOCK_DISTANCE`."""
+    """Replaces blocks [n, n, n] by Chebyshev distances to the nearest 0, at most `MAX_BLOCK_DISTANCE`."""
     n, partial = len(blocks), np.empty_like(blocks)
     for i in prange(n):
         for j in range(n):
@@ -188,18 +182,18 @@ def compute_block_distances(blocks):
 
 
 @jit
-def min_distance_over_rows(rows, here, out):
-    """out [n]: the least, over the rows around `here`, of what they hold, or how far away they are if that is more."""
-    out[:] = rows[here]
-    for other in range(max(here - MAX_BLOCK_DISTANCE + 1, 0), min(here + MAX_BLOCK_DISTANCE, len(rows))):
-        away, row = uint8(abs(other - here)), rows[other]
+def min_distance_over_rows(rows, center, out):
+    """Fills out [n] with the minimum over rows near `center` of max(value, distance of the row)."""
+    out[:] = rows[center]
+    for index in range(max(center - MAX_BLOCK_DISTANCE + 1, 0), min(center + MAX_BLOCK_DISTANCE, len(rows))):
+        distance, row = uint8(abs(index - center)), rows[index]
         for k in range(len(out)):
-            out[k] = min(out[k], max(away, row[k]))
+            out[k] = min(out[k], max(distance, row[k]))
 
 
 @kernel
 def ray_positions(origins, directions, ray, t, out):
-    """out [3, N] = origins[ray] + t * directions[ray]."""
+    """Fills out [3, N] = origins[ray] + t * directions[ray]."""
     for n in prange(len(t)):
         r = ray[n]
         for axis in range(3):
@@ -208,7 +202,7 @@ def ray_positions(origins, directions, ray, t, out):
 
 @kernel
 def mark_cells(positions, centre, half, unbounded, marks, resolution, value):
-    """Writes a value into the cells that hold places [3, N]. Two workers may write to one cell: the same value."""
+    """Writes `value` into the cells at positions [3, N]. Races are benign: all workers write the same value."""
     for n in prange(positions.shape[1]):
         u, v, w = to_unit(positions[0, n], positions[1, n], positions[2, n], centre, half, unbounded)
         marks[cell_number(u, v, w, resolution)] = value

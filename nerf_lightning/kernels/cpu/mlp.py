@@ -1,7 +1,7 @@
-"""A whole small network on one tile of samples at a time, so that its activations never leave the core's cache.
+"""Fused multilayer perceptron on tiles of samples, so that activations stay in the core's cache.
 
-Weights come as one flat array, layer after layer [O, I] then bias [O], every width padded with zeros to a multiple of four:
-the loops handle blocks of rows and samples at once, whose sums stay in registers.
+Weights are one flat array: each layer's matrix [O, I], then its bias [O], all widths zero-padded to multiples of four. Loops
+work on blocks of rows and samples whose sums stay in registers.
 """
 
 import numpy as np
@@ -11,16 +11,16 @@ from nerf_lightning.kernels.cpu.jit import jit, kernel
 from nerf_lightning.kernels.cpu.simd import MAX_LANES, broadcast, fma, horizontal_sum, load, prefetch, store
 
 TILE = 128
-"""Samples worked on together; a constant, so that the inner loops need no remainder."""
+"""Samples per tile; a constant, so that the inner loops need no remainder."""
 TILE_STRIDE = TILE + 16
-"""Room for a row of a tile: rows a power of two apart would all want the same few places of the cache."""
+"""Row stride of a tile: a power of two would cause cache conflicts."""
 LANES = (0,) * MAX_LANES
 """Samples of a tile in one register."""
 
 
 @jit
 def add_product(W, x, y):
-    """y += W x, four rows by two registers of samples at a time: eight sums, as many as a processor adds to at once."""
+    """y += W x in blocks of four rows by two registers of samples: eight independent sums hide the latency."""
     outputs, inputs = W.shape
     half = len(LANES)
     for n in range(0, TILE, 2 * half):
@@ -66,7 +66,7 @@ def input_gradient(W, dy, dx):
 
 @jit
 def add_weight_gradient(dW, db, dy, x):
-    """dW += dy x^T, db += the sum of dy: two rows by four columns at a time, each summed in the lanes of a register."""
+    """dW += dy x^T, db += sum of dy, in blocks of two rows by four columns, each summed in the lanes of a register."""
     outputs, inputs = dW.shape
     zero = broadcast(float32(0), LANES)
     for o in range(0, outputs, 2):
@@ -92,11 +92,11 @@ def add_weight_gradient(dW, db, dy, x):
 
 @jit
 def copy_columns(x, first, y, start, count):
-    """y[:, start : start + count] = x[:, first : first + count], for as many rows as the one that has fewer."""
+    """y[:, start : start + count] = x[:, first : first + count] for the rows that both have."""
     for i in range(min(len(x), len(y))):
         if count == TILE:
             for n in range(0, TILE, len(LANES)):
-                prefetch(x, i, first + TILE + n)  # where the next tile's come from
+                prefetch(x, i, first + TILE + n)  # source of the next tile
                 store(y, i, start + n, load(x, i, first + n, LANES))
         else:
             for n in range(count):
@@ -105,7 +105,7 @@ def copy_columns(x, first, y, start, count):
 
 @jit
 def fill_tile(x, extra, first, count, tile):
-    """Copies columns first : first + count of x, then of extra, into a tile; zeros fill the rest of it."""
+    """Fills a tile with columns first : first + count of x, then of extra, then zeros."""
     rows = len(x)
     copy_columns(x, first, tile, 0, count)
     copy_columns(extra, first, tile[rows:], 0, count)
@@ -116,7 +116,7 @@ def fill_tile(x, extra, first, count, tile):
 
 @jit
 def layer_parameters(weights, start, inputs, outputs):
-    """The matrix [O, I] and the bias [O] of the layer that begins at `start`."""
+    """Matrix [O, I] and bias [O] of the layer that begins at `start`."""
     end = start + outputs * inputs
     return weights[start:end].reshape(outputs, inputs), weights[end : end + outputs]
 
@@ -125,7 +125,7 @@ def layer_parameters(weights, start, inputs, outputs):
 def run_tile(weights, widths, activations):
     """Runs the network on the tile in the first rows of `activations`; each layer's output follows its input.
 
-    Returns the rows where the last output begins and the length of `weights`.
+    Returns the first row of the last output and the length of `weights`.
     """
     start, row, layers = 0, 0, len(widths) - 1
     for index in range(layers):
@@ -140,7 +140,7 @@ def run_tile(weights, widths, activations):
 
 @kernel
 def forward(weights, widths, x, extra, out, workers):
-    """out [O, N] from x [I, N] and extra [E, N]."""
+    """Fills out [O, N] from x [I, N] and extra [E, N]."""
     samples = x.shape[1]
     tiles = (samples + TILE - 1) // TILE
     for worker in prange(workers):
@@ -155,10 +155,10 @@ def forward(weights, widths, x, extra, out, workers):
 
 @kernel
 def backward(weights, widths, x, extra, grad_output, grad_x, grad_weights, workers):
-    """Fills grad_x [I, N] and one row of grad_weights [workers, W] a worker, running each tile's forward pass again."""
+    """Fills grad_x [I, N] and one row of grad_weights [workers, W] per worker; recomputes each tile's forward pass."""
     samples = x.shape[1]
     tiles, layers = (samples + TILE - 1) // TILE, len(widths) - 1
-    nothing = np.empty((0, samples), np.float32)
+    no_extra = np.empty((0, samples), np.float32)
     for worker in prange(workers):
         activations = np.empty((widths.sum(), TILE_STRIDE), np.float32)
         grad_out = np.empty((widths.max(), TILE_STRIDE), np.float32)
@@ -170,18 +170,18 @@ def backward(weights, widths, x, extra, grad_output, grad_x, grad_weights, worke
             count = min(TILE, samples - first)
             fill_tile(x, extra, first, count, activations[: widths[0]])
             row, start = run_tile(weights, widths, activations)
-            fill_tile(grad_output, nothing, first, count, grad_out[: widths[layers]])
+            fill_tile(grad_output, no_extra, first, count, grad_out[: widths[layers]])
             for index in range(layers - 1, -1, -1):
                 inputs, outputs = widths[index], widths[index + 1]
                 start -= outputs * inputs + outputs
                 row -= inputs
                 matrix, _ = layer_parameters(weights, start, inputs, outputs)
                 grad_matrix, grad_bias = layer_parameters(sums, start, inputs, outputs)
-                entered = activations[row : row + inputs]
-                add_weight_gradient(grad_matrix, grad_bias, grad_out[:outputs], entered)
+                layer_input = activations[row : row + inputs]
+                add_weight_gradient(grad_matrix, grad_bias, grad_out[:outputs], layer_input)
                 input_gradient(matrix, grad_out[:outputs], grad_in[:inputs])
                 if index > 0:
                     for i in range(inputs):
                         for n in range(TILE):
-                            grad_out[i, n] = grad_in[i, n] if entered[i, n] > float32(0) else float32(0)
+                            grad_out[i, n] = grad_in[i, n] if layer_input[i, n] > float32(0) else float32(0)
             copy_columns(grad_in, 0, grad_x, first, count)

@@ -1,4 +1,4 @@
-"""Intervals along rays in warped distances, and how they move to where the weight is."""
+"""Inverse transform sampling of intervals along rays in warped distances s."""
 
 from numba import float32, prange
 
@@ -8,7 +8,7 @@ from nerf_lightning.kernels.cpu.march import ray_span, to_unit, unwarp
 
 @jit(forceinline=True)
 def distance(s, span, unbounded):
-    """`Bounds.s_to_t` of one number."""
+    """`Bounds.s_to_t` of a scalar."""
     first, last, enter, leave, unit, low, length = span
     if not unbounded:
         return first + (last - first) * s
@@ -34,7 +34,7 @@ def interval_midpoints(origins, directions, near, far, inside, s, centre, half, 
 
 @kernel
 def resample(s, pdf, shift, floor, out):
-    """Fills out [R, K + 1] from s [R, S + 1] and share [R, S]: see `nerf_lightning.kernels.resampling.resample`."""
+    """Fills out [R, K + 1] from s [R, S + 1] and pdf [R, S]: see `nerf_lightning.kernels.resampling.resample`."""
     rays, steps, count = len(s), pdf.shape[1], out.shape[1] - 1
     for ray in prange(rays):
         total = float32(0)

@@ -1,6 +1,6 @@
-"""Several consecutive numbers as one value for numba, loaded, added, multiplied and stored in vector registers.
+"""SIMD values for numba: consecutive float32 numbers in vector registers.
 
-Numba compiles short loops to scalar instructions and cannot know that rows do not overlap.
+Needed because numba compiles short loops to scalar instructions and assumes that rows may overlap.
 """
 
 import operator
@@ -13,7 +13,7 @@ from nerf_lightning.kernels.cpu.jit import jit
 
 
 class SimdType(types.Type):
-    """`width` single-precision numbers."""
+    """Numba type of `width` float32 numbers."""
 
     def __init__(self, width):
         self.width = width
@@ -30,16 +30,16 @@ class _SimdModel(models.PrimitiveModel):
 
 
 def _pointer(context, builder, types_, values, width):
-    """To `width` numbers of an array's row, given array, row and first column."""
+    """Pointer to `width` numbers of an array's row, given array, row and first column."""
     array = context.make_array(types_[0])(context, builder, values[0])
-    place = [context.cast(builder, values[i], types_[i], types.intp) for i in (1, 2)]
-    pointer = cgutils.get_item_pointer(context, builder, types_[0], array, place, wraparound=False)
+    indices = [context.cast(builder, values[i], types_[i], types.intp) for i in (1, 2)]
+    pointer = cgutils.get_item_pointer(context, builder, types_[0], array, indices, wraparound=False)
     return builder.bitcast(pointer, ir.VectorType(ir.FloatType(), width).as_pointer())
 
 
 @intrinsic
 def load(typing, array, row, first, lanes):
-    """array[row, first : first + len(lanes)], inside a float32 array [., .] in C order; `lanes` is any tuple of that length."""
+    """Loads array[row, first : first + len(lanes)] of a C-ordered float32 array; `lanes` is any tuple of that length."""
     width = len(lanes)
 
     def code(context, builder, signature, values):
@@ -50,7 +50,7 @@ def load(typing, array, row, first, lanes):
 
 @intrinsic
 def store(typing, array, row, first, values):
-    """array[row, first : first + width] = values."""
+    """Stores array[row, first : first + width] = values."""
 
     def code(context, builder, signature, args):
         builder.store(args[3], _pointer(context, builder, signature.args, args, values.width), align=4)
@@ -61,14 +61,14 @@ def store(typing, array, row, first, values):
 
 @intrinsic
 def prefetch(typing, array, row, first):
-    """Brings array[row, first] and what stands beside it into the core's cache, without waiting for it."""
+    """Prefetches the cache line of array[row, first]."""
 
     def code(context, builder, signature, values):
         byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
-        ask = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
-        place = builder.bitcast(_pointer(context, builder, signature.args, values, 1), byte)
-        builder.call(ask, [place, number(0), number(3), number(1)])  # to read, more than once, data
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        pointer = builder.bitcast(_pointer(context, builder, signature.args, values, 1), byte)
+        builder.call(function, [pointer, number(0), number(3), number(1)])  # read, high locality, data cache
         return context.get_dummy_value()
 
     return types.none(array, row, first), code
@@ -76,7 +76,7 @@ def prefetch(typing, array, row, first):
 
 @intrinsic
 def broadcast(typing, a, lanes):
-    """One number, once for each entry of the tuple `lanes`, or of another value."""
+    """Vector of `a` in every lane; `lanes` is a tuple or a vector of that length."""
     width = len(lanes)
 
     def code(context, builder, signature, values):
@@ -89,26 +89,24 @@ def broadcast(typing, a, lanes):
 
 @intrinsic
 def horizontal_sum(typing, a):
-    """The sum of all lanes: that of the first half plus that of the second, and so on in each."""
+    """Sum of all lanes by recursive halving."""
 
     def code(context, builder, signature, values):
-        found, width = values[0], 1 << (a.width - 1).bit_length()
-        nothing = ir.Constant(found.type, [0.0] * a.width)
-        found = _shuffle(
-            builder, found, nothing, [min(i, a.width) for i in range(width)]
-        )  # filled up to a power of two
+        vector, width = values[0], 1 << (a.width - 1).bit_length()
+        zeros = ir.Constant(vector.type, [0.0] * a.width)
+        vector = _shuffle(builder, vector, zeros, [min(i, a.width) for i in range(width)])  # pad to a power of two
         while width > 1:
             width //= 2
-            first, second = (_shuffle(builder, found, found, range(start, start + width)) for start in (0, width))
-            found = builder.fadd(first, second)
-        return builder.extract_element(found, ir.IntType(32)(0))
+            first, second = (_shuffle(builder, vector, vector, range(start, start + width)) for start in (0, width))
+            vector = builder.fadd(first, second)
+        return builder.extract_element(vector, ir.IntType(32)(0))
 
     return types.float32(a), code
 
 
-def _shuffle(builder, first, second, places):
-    """The numbers at these places of two vectors joined end to end."""
-    mask = ir.Constant(ir.VectorType(ir.IntType(32), len(places)), list(places))
+def _shuffle(builder, first, second, indices):
+    """Elements of the concatenation of two vectors at these indices."""
+    mask = ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), list(indices))
     return builder.shuffle_vector(first, second, mask)
 
 
@@ -116,47 +114,45 @@ FEATURES = binding.get_host_cpu_features()
 HAS_FMA = FEATURES.get("fma", True)
 """Whether the processor has fused multiply-add; only some x86 ones lack it."""
 MAX_LANES = 16 if FEATURES.get("avx512f", False) else 8
-"""Numbers in the processor's widest registers; on those whose registers hold four, two together are one value."""
+"""Lanes of the widest vector; with registers of four lanes, LLVM splits it."""
 
 
 @intrinsic
 def fma(typing, a, b, c):
-    """a * b + c of three numbers or three values of one width, rounded once where the processor can."""
+    """Fused a * b + c of scalars or vectors of one width; rounds twice without hardware support."""
 
     def code(context, builder, signature, values):
         if not HAS_FMA:
             return builder.fadd(builder.fmul(values[0], values[1]), values[2])
         kind = values[0].type
         name = f"llvm.fma.v{a.width}f32" if isinstance(a, SimdType) else "llvm.fma.f32"
-        return builder.call(
-            cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name), values
-        )
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(kind, [kind] * 3), name)
+        return builder.call(function, values)
 
     return a(a, a, a), code
 
 
 @intrinsic
 def transpose(typing, source, row, column, target, to_row, to_column, lanes):
-    """target[to_row + j, to_column + i] = source[row + i, column + j] for i and j below the length of the tuple `lanes`, a
-    power of two."""
+    """Transposes a square: target[to_row + j, to_column + i] = source[row + i, column + j] for i, j < len(lanes) = 2^n."""
     width = len(lanes)
 
     def code(context, builder, signature, values):
-        def places(start):
-            """To all rows of a block, given where its array, row and column stand among the arguments."""
+        def pointers(start):
+            """Pointers to the rows of a square, given the index of its array among the arguments."""
             array, first, column = values[start : start + 3]
             kinds = signature.args[start], types.intp, signature.args[start + 2]
             first = context.cast(builder, first, signature.args[start + 1], types.intp)
             numbers = [builder.add(first, first.type(i)) for i in range(width)]
             return [_pointer(context, builder, kinds, (array, number, column), width) for number in numbers]
 
-        rows, half = [builder.load(place, align=4) for place in places(0)], width // 2
+        rows, half = [builder.load(pointer, align=4) for pointer in pointers(0)], width // 2
         lower = [i // 2 + width * (i % 2) for i in range(width)]
-        mixes = lower, [place + half for place in lower]
-        for _ in range(width.bit_length() - 1):  # each time, what says the row takes a bit from what says the column
+        mixes = lower, [index + half for index in lower]
+        for _ in range(width.bit_length() - 1):  # each pass moves one bit of the index from column to row
             rows = [_shuffle(builder, rows[i], rows[i + half], mix) for i in range(half) for mix in mixes]
-        for found, place in zip(rows, places(3), strict=True):
-            builder.store(found, place, align=4)
+        for row_vector, pointer in zip(rows, pointers(3), strict=True):
+            builder.store(row_vector, pointer, align=4)
         return context.get_dummy_value()
 
     return types.none(source, row, column, target, to_row, to_column, lanes), code
@@ -164,8 +160,7 @@ def transpose(typing, source, row, column, target, to_row, to_column, lanes):
 
 @jit
 def transpose_blocks(source, row, column, target, to_row, to_column, height, width, block):
-    """target[to_row + j, to_column + i] = source[row + i, column + j] for i < height and j < width, by squares with a side as
-    long as the tuple `block`."""
+    """Transposes a rectangle, as `transpose` with i < height and j < width, in squares of side len(block)."""
     side = len(block)
     for i in range(0, height - side + 1, side):
         for j in range(0, width - side + 1, side):

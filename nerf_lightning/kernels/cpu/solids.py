@@ -1,7 +1,7 @@
-"""Boxes and cylinders, rasterised and shaded; `nerf_lightning.synthetic.tracer` says what they are called with.
+"""Rasterization and shading of boxes and cylinders, for `nerf_lightning.synthetic.tracer`.
 
-Only + - * / and sqrt are used, which IEEE 754 fixes to the last bit, so that images are the same on every machine. Constants
-are single: a double among them would make doubles of all.
+Only + - * / and sqrt, which IEEE 754 fixes to the last bit, so that images are the same on every machine. Constants are
+float32: one float64 would promote all results.
 """
 
 import numpy as np
@@ -13,13 +13,13 @@ single = np.float32
 ZERO, HALF, ONE, TWO, TINY, INF = (single(number) for number in (0, 0.5, 1, 2, 1e-6, np.inf))
 CHEQUER, STRIPES, BRICKWORK = 1, 2, 3
 LIGHT_POSITION = (single(4.5), single(5.0), single(10.0))
-"""Position of the key light, world frame; no fall-off with distance."""
+"""Position of the key light, world frame; without distance attenuation."""
 FILL_DIRECTION = tuple(single(part) / single(np.sqrt(0.985)) for part in (-0.65, -0.60, 0.45))
 """Unit direction towards the fill light, which casts no shadow."""
 SKY, FLOOR = np.array([0.30, 0.32, 0.36], np.float32), np.array([0.13, 0.12, 0.10], np.float32)
 KEY_LIGHT_WEIGHT, FILL_LIGHT_WEIGHT, JOINT = single(0.80), single(0.32), single(0.09)
 SHADOW_BIAS = single(0.01)
-"""World units a surface may lie behind the shadow map: more than the slope of a texel, less than a stud."""
+"""Shadow-map bias, world units: more than the slope of a texel, less than a stud."""
 
 
 @jit
@@ -45,7 +45,7 @@ def normalize(v):
 
 @jit
 def cross_slab(o, d):
-    """Distances at which a ray crosses -1 and 1 along one axis, the nearer first."""
+    """Entry and exit distance of a ray through the slab [-1, 1] along one axis."""
     inverse = ONE / d
     low, high = (-ONE - o) * inverse, (ONE - o) * inverse
     return np.minimum(low, high), np.maximum(low, high)
@@ -53,14 +53,14 @@ def cross_slab(o, d):
 
 @jit
 def entry_distance(cylinder, o, d):
-    """The t at which a ray o + t * d enters the unit cube or cylinder (axis z), from outside; inf where it does not."""
-    # A ray along a face divides by zero: infinities do the right thing, and the nan of one inside a face compares false.
+    """Entry distance t of a ray o + t * d into the cube [-1, 1]^3 or its cylinder (axis z), from outside; inf for a miss."""
+    # A ray along a face divides by zero: infinities are correct, and the NaN of a ray inside a face compares false.
     near, far = cross_slab(o[2], d[2])
     if cylinder:
-        # A ray along the axis has no crossing to solve for: tilt it by less than single precision can see.
+        # A ray along the axis has no crossing: tilt it by less than float32 resolves.
         dx, dy = TINY if abs(d[0]) + abs(d[1]) < TINY else d[0], d[1]
         a = dx * dx + dy * dy
-        # Distance from the axis by the cross product: small numbers stay small where b^2 - ac would cancel.
+        # Distance from the axis by the cross product, as b^2 - ac would cancel.
         cross = o[0] * dy - o[1] * dx
         if a < cross * cross:
             return INF
@@ -75,12 +75,12 @@ def entry_distance(cylinder, o, d):
 
 @kernel
 def rasterize(cylinder, lift, eye, first, last, solid, depth, workers):
-    """Writes what is nearest at each pixel [H, W]: the solid, and t.
+    """Writes the nearest solid and its t at each pixel [H, W].
 
     Args:
-        lift: [P, 3, 3], from (u, v, 1) in pixels to a ray's direction in each solid's own frame.
-        eye: [P, 3], the camera there.
-        first, last: [P, 2], column and row where the pixels that a solid may cover begin and end.
+        lift: [P, 3, 3], from (u, v, 1) in pixels to a ray's direction in each solid's frame.
+        eye: [P, 3], camera position in each solid's frame.
+        first, last: [P, 2], column and row bounds of each solid's pixels.
     """
     height = len(depth)
     for worker in prange(workers):
@@ -99,7 +99,7 @@ def rasterize(cylinder, lift, eye, first, last, solid, depth, workers):
 
 @jit
 def find_normal(cylinder, unit):
-    """Outward normal at a point of the unit cube or cylinder, and the number of the axis whose face it is on (0: the curve)."""
+    """Outward normal at a point of the unit cube or cylinder, and the axis of its face (0 for the curved side)."""
     x, y, z = unit
     radius = np.sqrt(x * x + y * y) if cylinder else abs(x)
     if abs(z) > radius and (cylinder or abs(z) > abs(y)):
@@ -111,15 +111,15 @@ def find_normal(cylinder, unit):
 
 @jit
 def has_accent(pattern, period, x, y, z, face):
-    """Whether a pattern shows its second colour, given the place in the solid (from its lower corner) and the face."""
-    # Along the face: u is horizontal on a side, v is vertical; x and y on a top.
+    """Whether a pattern shows its accent colour at a point (relative to the solid's lower corner) of a face."""
+    # Face coordinates: u horizontal and v vertical on a side; x and y on top.
     u, v = y if face == 0 else x, y if face == 2 else z
     if pattern == CHEQUER:
         return (np.floor(u / period) + np.floor(v / period)) % 2 == 1
     if pattern == STRIPES:
         return np.floor((u + v) / period) % 2 == 1
     if pattern == BRICKWORK:
-        # Courses one period high of bricks three long, every other course moved by half a brick.
+        # Courses one period high, bricks three periods long, every other course shifted by half a brick.
         course, length = np.floor(v / period), period * single(3)
         along = (u + (course % TWO) * length / TWO) % length
         return min(along, v - course * period) < JOINT * period
@@ -128,24 +128,25 @@ def has_accent(pattern, period, x, y, z, face):
 
 @jit
 def is_lit(shadow, solid, point):
-    """Whether the key light reaches a point (world frame) on a solid, or on none of them (-1)."""
+    """Whether a point (world frame) on a solid (-1: none) is lit by the key light."""
     x, y, z = transform(shadow.rotation.T, subtract(point, LIGHT_POSITION))
     size, focal = len(shadow.depth), single(shadow.focal)
     col = int(min(max(focal * x / z + single(size / 2), ZERO), single(size - 1)))
     row = int(min(max(focal * y / z + single(size / 2), ZERO), single(size - 1)))
-    # A convex solid never shadows its own lit side, so the same solid in the map needs no bias at all.
+    # A convex solid never shadows its lit side, so the same solid in the map needs no bias.
     return shadow.solid[row, col] == solid or z <= shadow.depth[row, col] + SHADOW_BIAS
 
 
 @jit
 def add_colour(solids, shadow, k, point, direction, out):
-    """Adds sRGB of a point on solid k, seen along a unit direction, to out [3]: Lambert, ambient and Blinn-Phong."""
-    place, half = transform(solids.axes[k], subtract(point, solids.centre[k])), solids.half_size[k]
-    own, face = find_normal(solids.is_cylinder[k], (place[0] / half[0], place[1] / half[1], place[2] / half[2]))
-    corner = (place[0] + half[0], place[1] + half[1], place[2] + half[2])
+    """Adds the sRGB colour of a point on solid k in a unit viewing direction to out [3]: Lambert, ambient, Blinn-Phong."""
+    local, half = transform(solids.axes[k], subtract(point, solids.centre[k])), solids.half_size[k]
+    unit = local[0] / half[0], local[1] / half[1], local[2] / half[2]
+    local_normal, face = find_normal(solids.is_cylinder[k], unit)
+    corner = (local[0] + half[0], local[1] + half[1], local[2] + half[2])
     accent = has_accent(solids.pattern[k], solids.period[k], corner[0], corner[1], corner[2], face)
     albedo = solids.accent[k] if accent else solids.colour[k]
-    normal = transform(solids.axes[k].T, own)
+    normal = transform(solids.axes[k].T, local_normal)
     light = normalize(subtract(LIGHT_POSITION, point))
     key = max(dot(normal, light), ZERO) * single(is_lit(shadow, k, point))
     fill = max(dot(normal, FILL_DIRECTION), ZERO)
@@ -156,20 +157,19 @@ def add_colour(solids, shadow, k, point, direction, out):
     up = (normal[2] + ONE) / TWO
     for channel in range(3):
         ambient = FLOOR[channel] + (SKY[channel] - FLOOR[channel]) * up
-        # A square root stands for the sRGB curve.
-        out[channel] += np.sqrt(
-            min(albedo[channel] * (ambient + KEY_LIGHT_WEIGHT * key + FILL_LIGHT_WEIGHT * fill) + highlight, ONE)
-        )
+        # Square root approximates the sRGB curve.
+        diffuse = ambient + KEY_LIGHT_WEIGHT * key + FILL_LIGHT_WEIGHT * fill
+        out[channel] += np.sqrt(min(albedo[channel] * diffuse + highlight, ONE))
 
 
 @kernel
 def shade(solids, shadow, K, c2w, solid, depth, rgba, workers):
-    """Writes an image [H, W, 4], straight alpha in bytes, each pixel the mean of n x n samples.
+    """Writes an image [H, W, 4] in bytes with straight alpha, each pixel the mean of n x n samples.
 
     Args:
         solids, shadow: see `nerf_lightning.synthetic`.
-        K, c2w: of the camera of n times the pixels.
-        solid, depth: what `rasterize` found for it.
+        K, c2w: camera with n times the resolution.
+        solid, depth: output of `rasterize` for it.
     """
     height, width = rgba.shape[:2]
     n = len(solid) // height
@@ -185,13 +185,13 @@ def shade(solids, shadow, K, c2w, solid, depth, rgba, workers):
                             continue
                         x, y = (j + 0.5 - K[0, 2]) / K[0, 0], (i + 0.5 - K[1, 2]) / K[1, 1]
                         ray = transform(c2w, (x, y, 1.0))
-                        way, t = (single(ray[0]), single(ray[1]), single(ray[2])), depth[i, j]
-                        point = (c2w[0, 3] + t * way[0], c2w[1, 3] + t * way[1], c2w[2, 3] + t * way[2])
+                        offset, t = (single(ray[0]), single(ray[1]), single(ray[2])), depth[i, j]
+                        point = (c2w[0, 3] + t * offset[0], c2w[1, 3] + t * offset[1], c2w[2, 3] + t * offset[2])
                         length = single(np.sqrt(x * x + y * y + 1))
-                        direction = (way[0] / length, way[1] / length, way[2] / length)
+                        direction = (offset[0] / length, offset[1] / length, offset[2] / length)
                         add_colour(solids, shadow, solid[i, j], point, direction, total)
                         count += 1
-                # Averaged in sRGB, as a field's renderer composites it, over the samples that hit: alpha says how many did.
+                # Averaged in sRGB, as the volume renderer composites, over the samples that hit; alpha is their fraction.
                 for channel in range(3):
                     rgba[row, col, channel] = np.rint(total[channel] / max(count, 1) * 255)
                 rgba[row, col, 3] = np.rint(count / (n * n) * 255)

@@ -1,4 +1,4 @@
-"""TensoRF's planes times lines and their gradient: whole rows of channels at once at each sample."""
+"""TensoRF's planes times lines and their gradient, vectorized over the channels of each sample."""
 
 import numpy as np
 from numba import float32, prange, uint32
@@ -8,22 +8,22 @@ from nerf_lightning.kernels.cpu.jit import jit, kernel
 from nerf_lightning.kernels.cpu.simd import broadcast, horizontal_sum, load, prefetch, store, transpose_blocks
 
 TILE = 512
-"""Samples worked on together where features [C, N] turn into rows [N, C], or back: long runs in memory, still in cache."""
+"""Samples transposed together between features [C, N] and rows [N, C]: long runs in memory, still in cache."""
 PREFETCH_DISTANCE = 8
-"""Samples by which a plane's rows are asked for in advance: a large one does not fit the core's cache."""
+"""Samples by which plane rows are prefetched: a large plane does not fit the core's cache."""
 
 
 @jit
 def scratch_buffers():
-    """What `locate_vertices` fills for a tile: rows of the plane, fractions in its cells, rows of the line, fractions on it."""
+    """Buffers of `locate_vertices` for a tile: plane rows, fractions in plane cells, line rows, fractions on the line."""
     corners, ends = np.empty(TILE + PREFETCH_DISTANCE, np.uint32), np.empty(TILE, np.uint32)
     return corners, np.empty((2, TILE), np.float32), ends, np.empty(TILE, np.float32)
 
 
 @jit
 def locate_vertices(unit, first, count, mode, cells, at):
-    """Locates positions [3, N] from `first` on: fills `scratch_buffers` with the rows of the lower corners, the last one a few
-    times more, and with those of the lower ends on the line along axis `mode`."""
+    """Locates positions [3, N] from `first` on: fills `scratch_buffers` with the rows of the lower plane corners (padded for
+    the prefetch) and of the lower ends on the line along axis `mode`."""
     corners, plane_fractions, ends, line_fractions = at
     across, down = unit[1 if mode == 0 else 0], unit[1 if mode == 2 else 2]
     for k in range(count):
@@ -36,7 +36,7 @@ def locate_vertices(unit, first, count, mode, cells, at):
 
 @jit
 def load_grad_rows(grad_output, feature, first, count, rows, lanes, block):
-    """rows[k, c] = grad_output[feature + c, first + k], or grad_output[0, first + k] where that is the only row."""
+    """Fills rows[k, c] = grad_output[feature + c, first + k], or grad_output[0, first + k] if that is the only row."""
     if len(grad_output) > 1:
         transpose_blocks(grad_output, feature, first, rows, 0, 0, rows.shape[1], count, block)
     else:
@@ -46,7 +46,7 @@ def load_grad_rows(grad_output, feature, first, count, rows, lanes, block):
 
 @jit(inline="always")
 def prefetch_corners(plane, corner, cells, first):
-    """Brings the rows of a cell's corners near, without waiting for them."""
+    """Prefetches the rows of a cell's corners."""
     next_row = corner + uint32(cells + 1)
     prefetch(plane, corner, first)
     prefetch(plane, corner + uint32(1), first)
@@ -64,14 +64,14 @@ def interpolate_plane(plane, corner, cells, fa, fb, first, lanes):
 
 
 @jit(inline="always")
-def interpolate_line(line, place, f, first, lanes):
+def interpolate_line(line, line_row, f, first, lanes):
     """Linear interpolation of the channels from `first` on."""
-    return (float32(1) - f) * load(line, place, first, lanes) + f * load(line, place + uint32(1), first, lanes)
+    return (float32(1) - f) * load(line, line_row, first, lanes) + f * load(line, line_row + uint32(1), first, lanes)
 
 
 @jit(inline="always")
 def plane_line_product(plane, line, k, cells, at, lanes):
-    """All channels of a plane times those of the line across it, at place k of a tile; a later one's rows are asked for."""
+    """Product of plane and line for all channels at position k of a tile; prefetches a later position's rows."""
     corners, plane_fractions, ends, line_fractions = at
     prefetch_corners(plane, corners[k + PREFETCH_DISTANCE], cells, 0)
     value = interpolate_plane(plane, corners[k], cells, plane_fractions[0, k], plane_fractions[1, k], 0, lanes)
@@ -80,13 +80,12 @@ def plane_line_product(plane, line, k, cells, at, lanes):
 
 @kernel
 def products(planes, lines, unit, out, lanes, block, workers):
-    """out [3 C, N] from planes [3, S S, C], lines [3, S, C] and unit [3, N]. `lanes` is a tuple of length C, `block` one of a
-    length that divides it."""
+    """Fills out [3 C, N] from planes [3, S S, C], lines [3, S, C] and unit [3, N]; len(lanes) = C, a multiple of len(block)."""
     samples, cells, channels = unit.shape[1], lines.shape[1] - 1, len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
         rows, at = np.empty((TILE, len(lanes)), np.float32), scratch_buffers()
-        # One mode after the other: its plane then stays in the core's cache.
+        # Mode by mode, so that the plane stays in the core's cache.
         for mode in range(3):
             plane, line = planes[mode], lines[mode]
             for first in range(start, end, TILE):
@@ -99,7 +98,7 @@ def products(planes, lines, unit, out, lanes, block, workers):
 
 @kernel
 def sums(planes, lines, unit, out, lanes, workers):
-    """out [1, N]: what `products` gives, summed over its features."""
+    """Fills out [1, N] with the sum over features of `products`."""
     samples, cells = unit.shape[1], lines.shape[1] - 1
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
@@ -121,7 +120,7 @@ def add_to_row(rows, row, first, values, lanes):
 
 @jit
 def scatter_block(plane, line, grad_plane, grad_line, unit, grad_output, feature, mode, channel, lanes, block):
-    """Adds the gradient of one mode's channels from `channel` on, which are the features from `feature` on."""
+    """Accumulates the gradient of one mode's channels from `channel` on, which are features from `feature` on."""
     samples, cells, one = unit.shape[1], len(line) - 1, uint32(1)
     rows, at = np.empty((TILE, len(lanes)), np.float32), scratch_buffers()
     corners, plane_fractions, ends, line_fractions = at
@@ -132,19 +131,14 @@ def scatter_block(plane, line, grad_plane, grad_line, unit, grad_output, feature
         for k in range(count):
             prefetch_corners(plane, corners[k + PREFETCH_DISTANCE], cells, channel)
             prefetch_corners(grad_plane, corners[k + PREFETCH_DISTANCE], cells, channel)
-            corner, fa, fb, place, fc = (
-                corners[k],
-                plane_fractions[0, k],
-                plane_fractions[1, k],
-                ends[k],
-                line_fractions[k],
-            )
+            corner, fa, fb = corners[k], plane_fractions[0, k], plane_fractions[1, k]
+            line_row, fc = ends[k], line_fractions[k]
             ga, gb, next_row = float32(1) - fa, float32(1) - fb, corner + uint32(cells + 1)
-            given = load(rows, k, 0, lanes)
-            to_line = given * interpolate_plane(plane, corner, cells, fa, fb, channel, lanes)
-            to_plane = given * interpolate_line(line, place, fc, channel, lanes)
-            add_to_row(grad_line, place, channel, (float32(1) - fc) * to_line, lanes)
-            add_to_row(grad_line, place + one, channel, fc * to_line, lanes)
+            grad_row = load(rows, k, 0, lanes)
+            to_line = grad_row * interpolate_plane(plane, corner, cells, fa, fb, channel, lanes)
+            to_plane = grad_row * interpolate_line(line, line_row, fc, channel, lanes)
+            add_to_row(grad_line, line_row, channel, (float32(1) - fc) * to_line, lanes)
+            add_to_row(grad_line, line_row + one, channel, fc * to_line, lanes)
             add_to_row(grad_plane, corner, channel, ga * gb * to_plane, lanes)
             add_to_row(grad_plane, corner + one, channel, ga * fb * to_plane, lanes)
             add_to_row(grad_plane, next_row, channel, fa * gb * to_plane, lanes)
@@ -153,16 +147,16 @@ def scatter_block(plane, line, grad_plane, grad_line, unit, grad_output, feature
 
 @kernel
 def scatter(planes, lines, unit, grad_output, grad_planes, grad_lines, block, pair, workers):
-    """Adds to the gradients. A mode's block of channels, as many as `block`, belongs to one worker, so no two share a place.
+    """Accumulates the gradients. Each block of len(block) channels belongs to one worker, which avoids races.
 
     Args:
-        grad_output: [3 C, N], or one row that serves all features.
-        pair: a tuple of twice the length of `block`: two blocks that a worker has of one mode are added together.
+        grad_output: [3 C, N], or one row for all features.
+        pair: tuple of twice the length of `block`, to process two blocks of one mode together.
     """
     channels = planes.shape[2]
     blocks = channels // len(block)
     for worker in prange(workers):
-        # Neighbouring blocks go to one worker: two workers on one plane would fight over cache lines.
+        # Adjacent blocks go to one worker, to avoid false sharing of cache lines.
         index, end = 3 * blocks * worker // workers, 3 * blocks * (worker + 1) // workers
         while index < end:
             mode, channel, feature = index // blocks, index % blocks * len(block), index * len(block)
@@ -177,7 +171,7 @@ def scatter(planes, lines, unit, grad_output, grad_planes, grad_lines, block, pa
 
 @jit(inline="always")
 def plane_gradient(plane, corner, cells, fa, fb, lanes):
-    """How all channels change per cell along the plane's first axis, and along its second."""
+    """Gradient of bilinear interpolation for all channels along the plane's two axes, per cell."""
     ga, gb, one, less = float32(1) - fa, float32(1) - fb, uint32(1), float32(-1)
     next_row = corner + uint32(cells + 1)
     a, b = load(plane, corner, 0, lanes), load(plane, corner + one, 0, lanes)
@@ -187,7 +181,7 @@ def plane_gradient(plane, corner, cells, fa, fb, lanes):
 
 @kernel
 def position_gradient(planes, lines, unit, grad_output, grad, lanes, block, workers):
-    """Fills grad [3, N], the gradient in the places; `grad_output` as in `scatter`, `lanes` and `block` as in `products`."""
+    """Fills grad [3, N], the gradient in the positions; `grad_output` as in `scatter`, `lanes` and `block` as in `products`."""
     samples, cells, channels = unit.shape[1], lines.shape[1] - 1, len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
@@ -203,17 +197,12 @@ def position_gradient(planes, lines, unit, grad_output, grad, lanes, block, work
                 load_grad_rows(grad_output, mode * channels, first, count, rows, lanes, block)
                 for k in range(count):
                     prefetch_corners(plane, corners[k + PREFETCH_DISTANCE], cells, 0)
-                    n, corner, fa, fb, place = (
-                        first + k,
-                        corners[k],
-                        plane_fractions[0, k],
-                        plane_fractions[1, k],
-                        ends[k],
-                    )
-                    given = load(rows, k, 0, lanes)
-                    to_plane = given * interpolate_line(line, place, line_fractions[k], 0, lanes)
-                    change = load(line, place + one, 0, lanes) + float32(-1) * load(line, place, 0, lanes)
-                    to_line = given * interpolate_plane(plane, corner, cells, fa, fb, 0, lanes)
+                    n, corner, line_row = first + k, corners[k], ends[k]
+                    fa, fb = plane_fractions[0, k], plane_fractions[1, k]
+                    grad_row = load(rows, k, 0, lanes)
+                    to_plane = grad_row * interpolate_line(line, line_row, line_fractions[k], 0, lanes)
+                    change = load(line, line_row + one, 0, lanes) + float32(-1) * load(line, line_row, 0, lanes)
+                    to_line = grad_row * interpolate_plane(plane, corner, cells, fa, fb, 0, lanes)
                     da, db = plane_gradient(plane, corner, cells, fa, fb, lanes)
                     grad[first_axis, n] += cells_per_unit(unit[first_axis, n], cells) * horizontal_sum(to_plane * da)
                     grad[second_axis, n] += cells_per_unit(unit[second_axis, n], cells) * horizontal_sum(to_plane * db)

@@ -1,7 +1,7 @@
-"""Trilinear interpolation on a sparse grid of vertices, and its gradient.
+"""Trilinear interpolation on a sparse voxel grid and its gradient.
 
-For gradients each worker owns a run of rows: it visits all samples in order and adds to its own rows only, so that the sums
-do not depend on the number of workers. Row 0, for all vertices that are not kept, is constant.
+For gradients each worker owns a run of rows: it visits all samples in order and adds to these rows only, so that the sums
+do not depend on the number of workers. Row 0, of pruned vertices, is constant.
 """
 
 import numpy as np
@@ -14,14 +14,14 @@ from nerf_lightning.kernels.cpu.simd import horizontal_sum, load, store, transpo
 TILE = 64
 """Samples whose basis functions are transposed together."""
 SQUARE = (0,) * 8
-"""As long as the side of the squares in which that is done."""
+"""Tuple with the length of a square's side in that transposition."""
 BINS = 256
-"""Pieces of the table in which a gradient's work is counted before it is divided among workers."""
+"""Histogram bins of the table's rows for load balancing."""
 
 
 @jit
 def corners(unit, n, index, cells):
-    """Rows and weights of the eight vertices around sample n, the last coordinate fastest."""
+    """Rows and weights of the eight vertices around sample n, last coordinate fastest."""
     side = int64(cells + 1)
     i, fx = cell_of(unit[0, n], cells)
     j, fy = cell_of(unit[1, n], cells)
@@ -45,7 +45,7 @@ def locate_vertices(index, cells, unit, rows, weights):
 
 @kernel
 def position_gradient(cells, unit, grad_output, grad):
-    """Fills grad [3, N], the gradient in the places, from that in the weights, `grad_output` [N, 8]."""
+    """Fills grad [3, N], the gradient in the positions, from that in the weights, `grad_output` [N, 8]."""
     for n in prange(unit.shape[1]):
         x, fx = cell_of(unit[0, n], cells)
         y, fy = cell_of(unit[1, n], cells)
@@ -58,7 +58,7 @@ def position_gradient(cells, unit, grad_output, grad):
 
 @kernel
 def mark_rows(last_read_step, rows, step):
-    """seen [V] = step at all rows [N, 8]. Two workers may write to one row: the same value."""
+    """Sets last_read_step [V] = step at rows [N, 8]. Races are benign: all workers write the same value."""
     for n in prange(rows.shape[0]):
         for corner in range(8):
             last_read_step[rows[n, corner]] = step
@@ -66,7 +66,7 @@ def mark_rows(last_read_step, rows, step):
 
 @kernel
 def interpolate(values, index, cells, unit, out):
-    """out [N] from values [V] and unit [3, N]."""
+    """Fills out [N] from values [V] and unit [3, N]."""
     for n in prange(len(out)):
         r, w = corners(unit, n, index, cells)
         low = (w[0] * values[r[0]] + w[1] * values[r[1]]) + (w[2] * values[r[2]] + w[3] * values[r[3]])
@@ -76,7 +76,7 @@ def interpolate(values, index, cells, unit, out):
 
 @kernel
 def read(density, colour, rows, weights, raw, rgb):
-    """raw [N] from density [V], and rgb [3, N] from colour [V, 3]."""
+    """Fills raw [N] from density [V], and rgb [3, N] from colour [V, 3]."""
     for n in prange(len(raw)):
         s, a, b, c = float32(0), float32(0), float32(0), float32(0)
         for corner in range(8):
@@ -100,7 +100,7 @@ def weight_gradient(density, colour, rows, raw, rgb, grad):
 
 @kernel
 def add_sh_colour(sh_coefficients, rows, weights, basis, rgb, lanes, workers):
-    """Adds to rgb [3, N] the interpolated views [V, 3 B] times basis [B, N]; `lanes` is a tuple of length B."""
+    """Adds to rgb [3, N] the interpolated coefficients [V, 3 B] times basis [B, N]; `lanes` is a tuple of length B."""
     samples, terms = rows.shape[0], len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
@@ -119,15 +119,15 @@ def add_sh_colour(sh_coefficients, rows, weights, basis, rgb, lanes, workers):
                     a = a + weight * load(sh_coefficients, row, 0, lanes)
                     b = b + weight * load(sh_coefficients, row, terms, lanes)
                     c = c + weight * load(sh_coefficients, row, 2 * terms, lanes)
-                given = load(tile, k, 0, lanes)
-                rgb[0, n] += horizontal_sum(a * given)
-                rgb[1, n] += horizontal_sum(b * given)
-                rgb[2, n] += horizontal_sum(c * given)
+                basis_row = load(tile, k, 0, lanes)
+                rgb[0, n] += horizontal_sum(a * basis_row)
+                rgb[1, n] += horizontal_sum(b * basis_row)
+                rgb[2, n] += horizontal_sum(c * basis_row)
 
 
 @kernel
 def add_sh_weight_gradient(sh_coefficients, rows, basis, rgb, grad, lanes, workers):
-    """Adds to grad [N, 8] what the views [V, 3 B] times basis [B, N] contribute to the gradient in the weights."""
+    """Adds to grad [N, 8], the gradient in the weights, the part of coefficients [V, 3 B] times basis [B, N]."""
     samples, terms = rows.shape[0], len(lanes)
     for worker in prange(workers):
         start, end = samples * worker // workers, samples * (worker + 1) // workers
@@ -137,39 +137,37 @@ def add_sh_weight_gradient(sh_coefficients, rows, basis, rgb, grad, lanes, worke
             transpose_blocks(basis, 0, first, tile, 0, 0, terms, count, SQUARE)
             for k in range(count):
                 n = first + k
-                given = load(tile, k, 0, lanes)
+                basis_row = load(tile, k, 0, lanes)
                 for corner in range(8):
                     row = rows[n, corner]
-                    mixed = rgb[0, n] * load(sh_coefficients, row, 0, lanes) + rgb[1, n] * load(
-                        sh_coefficients, row, terms, lanes
-                    )
-                    grad[n, corner] += horizontal_sum(
-                        (mixed + rgb[2, n] * load(sh_coefficients, row, 2 * terms, lanes)) * given
-                    )
+                    weighted = rgb[0, n] * load(sh_coefficients, row, 0, lanes)
+                    weighted = weighted + rgb[1, n] * load(sh_coefficients, row, terms, lanes)
+                    weighted = weighted + rgb[2, n] * load(sh_coefficients, row, 2 * terms, lanes)
+                    grad[n, corner] += horizontal_sum(weighted * basis_row)
 
 
 @jit
 def balance_rows(rows, table, workers):
-    """Rows [workers + 1], from 1 to `table`, that bound each worker's share, so that all have about as much to do."""
+    """Row bounds [workers + 1], from 1 to `table`, that balance the load of the workers."""
     counts, width = np.zeros(BINS, np.int64), table // BINS + 1
-    for n in range(0, len(rows), 4):  # a sample of them is enough
+    for n in range(0, len(rows), 4):  # a subset is enough
         for corner in range(0, 8, 3):
             if rows[n, corner] > 0:
                 counts[rows[n, corner] // width] += 1
-    found = np.full(workers + 1, table)
-    found[0] = 1
-    everything, passed, worker = counts.sum(), 0, 1
+    bounds = np.full(workers + 1, table)
+    bounds[0] = 1
+    total, passed, worker = counts.sum(), 0, 1
     for b in range(BINS):
         passed += counts[b]
-        while worker < workers and passed * workers >= everything * worker:
-            found[worker] = min((b + 1) * width, table)
+        while worker < workers and passed * workers >= total * worker:
+            bounds[worker] = min((b + 1) * width, table)
             worker += 1
-    return found
+    return bounds
 
 
 @kernel
 def scatter(grad_density, grad_colour, rows, weights, raw, rgb, workers):
-    """Adds to the gradients [V] and [V, 3] from those of raw [N] and rgb [3, N]."""
+    """Accumulates the gradients [V] and [V, 3] from those of raw [N] and rgb [3, N]."""
     ends = balance_rows(rows, len(grad_density), workers)
     for worker in prange(workers):
         first, last = ends[worker], ends[worker + 1]
@@ -193,8 +191,8 @@ def scatter_sh_rows(grad, rows, weights, basis, rgb, lanes, first, last):
         transpose_blocks(basis, 0, begin, tile, 0, 0, terms, count, SQUARE)
         for k in range(count):
             n = begin + k
-            given = load(tile, k, 0, lanes)
-            a, b, c = rgb[0, n] * given, rgb[1, n] * given, rgb[2, n] * given
+            basis_row = load(tile, k, 0, lanes)
+            a, b, c = rgb[0, n] * basis_row, rgb[1, n] * basis_row, rgb[2, n] * basis_row
             for corner in range(8):
                 row, weight = rows[n, corner], weights[n, corner]
                 if first <= row < last:
@@ -205,7 +203,7 @@ def scatter_sh_rows(grad, rows, weights, basis, rgb, lanes, first, last):
 
 @kernel
 def scatter_sh(grad, rows, weights, basis, rgb, lanes, workers):
-    """Adds to the gradient [V, 3 B] from that of rgb [3, N]; a function of its own, as it is a third slower within the loop."""
+    """Accumulates the gradient [V, 3 B] from that of rgb [3, N]; inlining `scatter_sh_rows` would be a third slower."""
     ends = balance_rows(rows, len(grad), workers)
     for worker in prange(workers):
         scatter_sh_rows(grad, rows, weights, basis, rgb, lanes, ends[worker], ends[worker + 1])
@@ -213,20 +211,20 @@ def scatter_sh(grad, rows, weights, basis, rgb, lanes, workers):
 
 @kernel
 def total_variation(values, vertex_of_row, index, side, first, slope, sums, workers):
-    """For the rows from `first` on of values [V], as many as fit slope: the differences to all neighbours into slope, their
-    squares into sums [workers]."""
+    """Fills slope with the summed differences to all neighbours of rows of values [V] from `first` on, and sums [workers] with
+    their squares."""
     rows = len(slope)
     for worker in prange(workers):
         squares = 0.0
         for n in range(rows * worker // workers, rows * (worker + 1) // workers):
             at, value, difference = int64(vertex_of_row[first + n]), values[first + n], float32(0)
-            place, stride = (at // (side * side), at // side % side, at % side), (side * side, side, 1)
+            coords, stride = (at // (side * side), at // side % side, at % side), (side * side, side, 1)
             for axis in range(3):
                 for sign in (-1, 1):
-                    if 0 <= place[axis] + sign < side:
-                        other = index[at + sign * stride[axis]]
-                        if other > 0:
-                            d = value - values[other]
+                    if 0 <= coords[axis] + sign < side:
+                        neighbour = index[at + sign * stride[axis]]
+                        if neighbour > 0:
+                            d = value - values[neighbour]
                             difference += d
                             squares += d * d
             slope[n] = difference

@@ -1,1 +1,1 @@
-"""What several fields are made of."""
+"""Building blocks shared by fields."""

@@ -23,7 +23,7 @@ def _octaves(frequencies: int, dtype: torch.dtype, device: torch.device) -> Floa
 
 
 def num_sh_bases(degree: int) -> int:
-    """Number of spherical harmonics up to a degree, including the constant one."""
+    """Number of spherical harmonics of degrees 0 to `degree`."""
     return (degree + 1) ** 2
 
 

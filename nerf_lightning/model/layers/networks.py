@@ -1,7 +1,6 @@
-"""Small networks, also such that start from what a smaller one has learned: the same function, with room for more.
+"""Small networks, and warm starts of wide ones from narrow ones (Net2Net, Chen et al. 2016, section 2.3, without copies).
 
-New neurons have random input weights and zero weights into the old neurons of the next layer, so the old ones are unchanged and
-the new ones learn (Net2Net, Chen et al. 2016, section 2.3, without copies).
+New neurons have random input weights and zero weights into the old neurons of the next layer: the function is preserved.
 """
 
 from collections.abc import Iterable
@@ -14,40 +13,38 @@ from torch.nn import Linear
 
 
 def build_layers(*widths: int) -> torch.nn.ModuleList:
-    """Fully connected layers from each width to the next."""
+    """Linear layers from each width to the next."""
     return torch.nn.ModuleList(Linear(i, o) for i, o in pairwise(widths))
 
 
 def linear_layers(net: torch.nn.Module) -> list[Linear]:
-    """The fully connected layers of a network, in order."""
-    return [layer for layer in net.modules() if isinstance(layer, Linear)]
+    """Linear layers of a network, in order."""
+    return [x for x in net.modules() if isinstance(x, Linear)]
 
 
 def layer_parameters(net: torch.nn.ModuleList) -> list[tuple[Tensor, Tensor]]:
-    """Matrix and bias of each of `build_layers`."""
-    return [(layer.get_parameter("weight"), layer.get_parameter("bias")) for layer in net]
+    """Matrix and bias of each layer of `build_layers`."""
+    return [(x.get_parameter("weight"), x.get_parameter("bias")) for x in net]
 
 
 @torch.no_grad()
 def widen(wide: Iterable[Linear], narrow: Iterable[Linear], columns: Int[Tensor, "I"] | None = None) -> None:
-    """Gives the first outputs of consecutive layers the weights of smaller ones.
+    """Copies the weights of consecutive narrow layers into the first outputs of wide ones.
 
     Args:
-        wide, narrow: the layers; those of `wide` have as many outputs, or more.
-        columns: for each input of the first layer of `narrow`, the matching input of `wide`; None for the first ones.
+        wide, narrow: linear layers; no layer of `wide` has fewer outputs than its counterpart.
+        columns: input of the first layer of `wide` for each input of its counterpart; None: the first ones.
     """
-    for mine, its in zip(wide, narrow, strict=True):
-        kept = its.out_features
-        mine.weight[:kept] = 0
-        mine.weight[:kept, slice(its.in_features) if columns is None else columns] = its.weight
-        mine.bias[:kept] = its.bias
+    for ours, theirs in zip(wide, narrow, strict=True):
+        narrow_outputs = theirs.out_features
+        ours.weight[:narrow_outputs] = 0
+        ours.weight[:narrow_outputs, slice(theirs.in_features) if columns is None else columns] = theirs.weight
+        ours.bias[:narrow_outputs] = theirs.bias
         columns = None
 
 
 def is_at_least_as_wide(wide: torch.nn.Module, narrow: torch.nn.Module) -> bool:
-    """Whether no linear layer of a field is narrower than that of the same name in another."""
-    mine = dict(wide.named_modules())
-    both = ((mine.get(name), its) for name, its in narrow.named_modules())
-    return all(
-        one.out_features >= its.out_features for one, its in both if isinstance(one, Linear) and isinstance(its, Linear)
-    )
+    """Whether no linear layer of `wide` is narrower than the layer of the same name in `narrow`."""
+    ours = dict(wide.named_modules())
+    pairs = ((ours.get(name), theirs) for name, theirs in narrow.named_modules())
+    return all(x.out_features >= y.out_features for x, y in pairs if isinstance(x, Linear) and isinstance(y, Linear))
