@@ -40,7 +40,7 @@ def test_lock_new_run_folder_concurrent_runs_get_separate_folders(allow_suffix: 
         found = list(pool.map(begin, range(MANY)))
     names = [name for name in found if name.startswith("run")]
     assert len(set(names)) == len(names) == (MANY if allow_suffix else 1)
-    assert all("a run that is in progress" in line for line in set(found) - set(names))
+    assert all("a run is in progress" in line for line in set(found) - set(names))
     with (
         pytest.raises(RunFolderInUse, match="holds a run already"),
         lock_new_run_folder(tmp_path / "run", overwrite=False),
