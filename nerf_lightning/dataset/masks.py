@@ -93,11 +93,11 @@ def match_mask(
         shared = min(len(mask), len(photo)) - 1
         return (name == base if exact else extended) and mask[-1 - shared : -1] == photo[-1 - shared : -1]
 
-    found = [path for mask, path in masks if fits(mask, True)] or [path for mask, path in masks if fits(mask, False)]
-    if len(found) > 1:
-        shown = join_truncated([path.relative_to(folder).as_posix() for path in found], MAX_NAMED)
-        raise InputError(folder, "", f"{len(found)} masks for {file.name}: {shown}", hint="keep one")
-    return found[0] if found else None
+    matches = [path for mask, path in masks if fits(mask, True)] or [path for mask, path in masks if fits(mask, False)]
+    if len(matches) > 1:
+        shown = join_truncated([path.relative_to(folder).as_posix() for path in matches], MAX_NAMED)
+        raise InputError(folder, "", f"{len(matches)} masks for {file.name}: {shown}", hint="keep one")
+    return matches[0] if matches else None
 
 
 def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.ndarray, "H W"]:

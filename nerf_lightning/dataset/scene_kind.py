@@ -84,5 +84,5 @@ def check_visible_pixels(source: object, views: Views) -> None:
     """Raises InputError if alpha or masks remove every pixel."""
     is_transparent = views.channels == 4 and not bool(views.pixels[:, 3].any())
     if is_transparent or (views.valid_mask is not None and not bool(views.valid_mask.any())):
-        found = "alpha or masks leave out all of the training photos"
+        found = "alpha or masks remove every pixel of the training photos"
         raise InputError(source, "", found, hint="dataset.invert_masks=true?")

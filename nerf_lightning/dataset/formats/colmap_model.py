@@ -81,8 +81,8 @@ def read_model(folder: Path) -> tuple[list[RegisteredImage], Float[np.ndarray, "
         images.append(RegisteredImage(name, intrinsics[camera], invert_pose(files[1], name, np.array(pose))))
     if len({image.name for image in images}) < len(images):
         raise InputError(files[1], "", "two photos have one name", hint="rename one")
-    places = np.array(points, np.float64).reshape(-1, 3)
-    return images, places[(np.abs(places) <= checks.MAX_COORDINATE).all(1)]
+    xyz = np.array(points, np.float64).reshape(-1, 3)
+    return images, xyz[(np.abs(xyz) <= checks.MAX_COORDINATE).all(1)]
 
 
 def _read_rows(path: Path, parse: Callable[[Path], Iterator[Record]]) -> list[Record]:
