@@ -9,7 +9,12 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 GLOSSARY = ROOT / "docs" / "glossary.md"
-FILES = [file for room in ("nerf_lightning", "conf", "benchmarks") for file in sorted((ROOT / room).rglob("*.*"))]
+FILES = [
+    file
+    for room in ("nerf_lightning", "conf", "benchmarks")
+    for file in sorted((ROOT / room).rglob("*.*"))
+    if "__pycache__" not in file.parts
+]
 PARTS = re.compile(r"(?:^|_)(?:told|untold|beside|apart|suited|wish|held(?!_?out)|lit|worth|evenly|mostly)(?:$|_)")
 NAMES = r"around|behind|before|within|along|once|twice|kept|found|places?|share|spread|into|onto"
 CONSTANTS = (

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from nerf_lightning.capture.tags.detect import get_dictionary
 from nerf_lightning.capture.tags.tag_layout import TagLayout
-from nerf_lightning.kernels.cpu.solids import add_colour, dot, entry_distance, is_lit, subtract, transform
+from nerf_lightning.kernels.cpu.solids import add_colour, dot, entry_distance, is_unshadowed, subtract, transform
 from nerf_lightning.synthetic.solids import Solids, load_bulldozer
 from nerf_lightning.synthetic.tracer import render_shadow_map
 
@@ -199,4 +199,4 @@ def _shade_points(solids, shadow, solid, points, directions, rgb):
 @compiled
 def find_unshadowed_points(shadow, points):
     """Mask of the points [N, 3], on no solid, that the key light reaches."""
-    return np.array([is_lit(shadow, -1, points[n]) for n in range(len(points))])
+    return np.array([is_unshadowed(shadow, -1, points[n]) for n in range(len(points))])

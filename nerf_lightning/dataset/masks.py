@@ -114,11 +114,11 @@ def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.nda
     return np.asarray(cv2.resize(mask, (width, height), interpolation=interpolation), np.uint8)
 
 
-def is_cut_out_by_mask(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray, "H W"]) -> bool:
+def is_cut_out_by_mask(image: UInt8[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]) -> bool:
     """True if the masked region covers most of the border in one colour, that is, the subject was cut out."""
-    if extract_border(kept).mean() > 0.5:
+    if extract_border(mask).mean() > 0.5:
         return False
-    masked = image[..., :3][~kept]
+    masked = image[..., :3][~mask]
     middle = np.median(masked, axis=0)
     return bool(np.mean(np.abs(masked - middle).max(axis=1) <= MAX_COLOR_SPREAD) > 0.95)
 
@@ -126,7 +126,7 @@ def is_cut_out_by_mask(image: UInt8[np.ndarray, "H W C"], kept: Bool[np.ndarray,
 def is_inverted(masks: Sequence[Bool[np.ndarray, "_ _"]]) -> bool:
     """True if most masks remove a region in the middle and keep the borders: probably the subject."""
     grid = CELLS_PER_SIDE, CELLS_PER_SIDE
-    small = [cv2.resize(kept.astype(np.float32), grid, interpolation=cv2.INTER_AREA) for kept in masks]
-    kept = np.mean(small, axis=0)
+    small = [cv2.resize(mask.astype(np.float32), grid, interpolation=cv2.INTER_AREA) for mask in masks]
+    mask = np.mean(small, axis=0)
     quarter = CELLS_PER_SIDE // 4
-    return bool(kept[quarter:-quarter, quarter:-quarter].min() < 0.3 and extract_border(kept).mean() > 0.7)
+    return bool(mask[quarter:-quarter, quarter:-quarter].min() < 0.3 and extract_border(mask).mean() > 0.7)

@@ -42,10 +42,10 @@ class SampleCapacity:
         steps, kept = (math.ceil(self.HEADROOM * count * num_rays) for count in self.per_ray)
         return steps, kept
 
-    def record_counts(self, rays: Rays, steps: int, kept: int) -> None:
+    def record_counts(self, rays: Rays, steps: int, visible: int) -> None:
         """Records an exact count."""
         if rays.origins.device.type != "cpu":
-            self.per_ray = max(steps, 1) / len(rays), max(kept, 1) / len(rays)
+            self.per_ray = max(steps, 1) / len(rays), max(visible, 1) / len(rays)
 
 
 class OccupancySampler(Sampler):

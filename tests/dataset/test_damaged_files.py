@@ -132,7 +132,7 @@ JSON = [
     (frame(transform_matrix=np.eye(3).tolist()), "frames[3]: transform_matrix: found shape"),
     (frame(transform_matrix=[[math.nan] * 4] * 4), "frames[3].transform_matrix: found nan"),
     (frame(mask_path="no.png"), "no such file"),
-    (no_photos, "(nor are 11 more)"),
+    (no_photos, "and 11 more of 12 photos"),
     (frame(fl_x=None, fl_y=None), "no focal length"),
     (frame(fl_x=None, fl_y=None, camera_angle_x=62.0), "radians"),
     (frame(k1=-50.0), "is not invertible"),
@@ -155,17 +155,17 @@ COLMAP = [
     (put(f"{MODEL}/images.bin", 68, "i", 77), "0000.png: its camera 77"),
     (lambda scene: (scene / MODEL / "images.bin").write_bytes(bytes(8)), "0 photos"),
     (lambda scene: (scene / MODEL / "images.bin").unlink(), "a folder without a scene"),
-    (no_photos, "at least half of the photos"),
+    (no_photos, "and 11 more of 12 photos"),
     (picture("images/0003.png", 48, 40, 3), "0003.png: found 40x48 pixels, expected 48x40"),
-    (cut("images/0003.png", 200), "0003.png: found"),
+    (cut("images/0003.png", 200), "0003.png: no readable image"),
     (text("masks/0003.png", "a mask"), "masks/0003.png: no readable"),
 ]
 TEXT = [
     (replaced(f"{MODEL}/cameras.txt", "48 40", "48 forty"), "forty"),
     (replaced(f"{MODEL}/cameras.txt", "PINHOLE", "EUCM"), "camera model EUCM"),
-    (text(f"{MODEL}/images.txt", "1 1 0 0 0\n\n"), "images.txt: found"),
-    (replaced(f"{MODEL}/images.txt", "0001.png", "0000.png"), "two photos of one name"),
-    (text(f"{MODEL}/points3D.txt", "1 2\n"), "points3D.txt: found"),
+    (text(f"{MODEL}/images.txt", "1 1 0 0 0\n\n"), "images.txt: damaged"),
+    (replaced(f"{MODEL}/images.txt", "0001.png", "0000.png"), "two photos have one name"),
+    (text(f"{MODEL}/points3D.txt", "1 2\n"), "points3D.txt: damaged"),
 ]
 LLFF = [
     (rows(lambda a: a[:-2]), "10 poses, but 12 in images"),

@@ -78,7 +78,7 @@ def test_load_picture_png_kinds_become_rgb8(kind: str, bits: int, tmp_path: Path
 
 def test_load_picture_float_pixels_raise(tmp_path: Path):
     path = write(tmp_path / "a.tiff", np.zeros((4, 4, 3), np.float32))
-    with pytest.raises(InputError, match="expected .* of 8 or 16 bits a channel"):
+    with pytest.raises(InputError, match="a.tiff: no readable image"):
         load_picture(path)
 
 

@@ -152,8 +152,8 @@ def change_poses_of(scene: Scene, change: Callable[[np.ndarray], np.ndarray]) ->
 
 
 ORDERS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "each photo has that of the previous hypothesis": lambda c2w: np.roll(c2w, 1, axis=0),
-    "each photo has that of the next hypothesis": lambda c2w: np.roll(c2w, -1, axis=0),
+    "each photo has that of the previous one": lambda c2w: np.roll(c2w, 1, axis=0),
+    "each photo has that of the next one": lambda c2w: np.roll(c2w, -1, axis=0),
     "poses in the reverse order of the photos": lambda c2w: c2w[::-1].copy(),
     "names sorted as numbers": (lambda c2w: c2w[np.argsort(sorted(range(len(c2w)), key=lambda i: f"{i}.png"))]),
 }

@@ -45,7 +45,7 @@ def with_margin(views: Views) -> Views:
 
 SHOWN: dict[str, tuple[Callable[[Views], Views], bool, int, str]] = {
     "cut out": (lambda views: views, True, 4, "alpha cuts the subject out"),
-    "on grey": (lambda views: on_color(views, 90), True, 3, "borders have one color"),
+    "on grey": (lambda views: on_color(views, 90), True, 3, "borders have one colour"),
     "background": (lambda views: with_background(views, None), False, 3, "show a background"),
     "opaque alpha": (lambda views: with_background(views, 255), False, 3, "show a background"),
     "margins": (with_margin, False, 3, "show a background"),

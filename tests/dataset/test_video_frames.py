@@ -99,7 +99,7 @@ def truncate(file: Path) -> None:
     ("make", "message"),
     [
         (lambda file: None, "no such file"),
-        (cut, "cannot be decoded"),
+        (truncate, "cannot be decoded"),
         (lambda file: write_video(file, pan(SHIFTS[:1])), "found 1 frame, expected at least 3"),
     ],
 )

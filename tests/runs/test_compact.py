@@ -112,7 +112,7 @@ def test_load_compact_damaged_or_untrusted_file_raises(tmp_path: Path):
         (zeros_for_header(), "header: found 16777217 bytes"),
         (with_header(content, config={**config, "version": "9.9"}), "version 9.9"),
         (with_header(content, config={**config, "model": {"_target_": "os.system"}}), "a class of this package"),
-        (with_header(content, arrays={}), "the weights of the model"),
+        (with_header(content, arrays={}), "does not hold the model it names"),
         (with_header(content, scene=[]), "given.npz"),
     ):
         with pytest.raises(InputError, match=words):

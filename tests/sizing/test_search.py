@@ -94,7 +94,7 @@ def test_rightsize_accepts_images(tmp_path: Path):
     [
         ([], {"psnr": 3.0, "within_db": 1.0}, "one of the two"),
         ([], {"ladder": "none_such"}, "none_such"),
-        ([], {"output": Path()}, "in it"),
+        ([], {"output": Path()}, "holds other files"),
         (["budget.second=60"], {}, "budget.seconds"),
         (["sampler.samples=-1"], {}, "sampler.samples"),
     ],

@@ -8,7 +8,7 @@ import torch
 
 from benchmarks.synthetic.tabletop import find_nearest, shade_points
 from nerf_lightning.cameras import Bounds
-from nerf_lightning.kernels.cpu.solids import LIGHT_POSITION, is_lit
+from nerf_lightning.kernels.cpu.solids import LIGHT_POSITION, is_unshadowed
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.synthetic.solids import Solids, load_bulldozer
 from nerf_lightning.synthetic.tracer import rasterize, render_shadow_map
@@ -128,5 +128,5 @@ def test_render_shadow_map_agrees_with_rays_to_the_light(scene):
     first, way = find_nearest(load_bulldozer(), np.broadcast_to(light, points.shape), points - light)
     expected = (first == solid[hit]) | (way > 1 - 1e-3)
     assert 0.2 < expected.mean() < 0.95
-    found = [is_lit.py_func(render_shadow_map(), k, point) for k, point in zip(solid[hit], points, strict=True)]
+    found = [is_unshadowed.py_func(render_shadow_map(), k, point) for k, point in zip(solid[hit], points, strict=True)]
     assert (np.array(found) == expected).mean() > 0.96

@@ -122,15 +122,15 @@ def measure_frames(video: Path) -> tuple[Float[np.ndarray, "N"], Float[np.ndarra
     return np.array(motion), np.array(sharpness)
 
 
-def measure_motion(before: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
+def measure_motion(previous: UInt8[np.ndarray, "h w"], after: UInt8[np.ndarray, "h w"]) -> float:
     """Measures the motion between two small frames, relative to their longest side.
 
     The mean length of dense optical flow (Kroeger et al. 2016), weighted by contrast: textureless areas show no motion.
     """
-    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(before, after, None)  # type: ignore[call-overload]
-    contrast = np.hypot(*(cv2.Sobel(before, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))))
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST).calc(previous, after, None)  # type: ignore[call-overload]
+    contrast = np.hypot(*(cv2.Sobel(previous, cv2.CV_32F, *order) for order in ((1, 0), (0, 1))))
     pixels = float((np.linalg.norm(flow, axis=-1) * contrast).sum() / max(float(contrast.sum()), 1e-6))
-    return max(0.0, pixels - MIN_MOTION_PX) / max(before.shape)
+    return max(0.0, pixels - MIN_MOTION_PX) / max(previous.shape)
 
 
 def measure_sharpness(picture: UInt8[np.ndarray, "H W"]) -> float:

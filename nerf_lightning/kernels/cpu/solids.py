@@ -10,7 +10,7 @@ from numba import prange
 from nerf_lightning.kernels.cpu.jit import jit, kernel
 
 single = np.float32
-ZERO, HALF, ONE, TWO, TINY, INF = (single(number) for number in (0, 0.5, 1, 2, 1e-6, np.inf))
+ZERO, HALF, ONE, TWO, EPSILON, INF = (single(number) for number in (0, 0.5, 1, 2, 1e-6, np.inf))
 CHEQUER, STRIPES, BRICKWORK = 1, 2, 3
 LIGHT_POSITION = (single(4.5), single(5.0), single(10.0))
 """Position of the key light, world frame; without distance attenuation."""
@@ -58,7 +58,7 @@ def entry_distance(cylinder, o, d):
     near, far = cross_slab(o[2], d[2])
     if cylinder:
         # A ray along the axis has no crossing: tilt it by less than float32 resolves.
-        dx, dy = TINY if abs(d[0]) + abs(d[1]) < TINY else d[0], d[1]
+        dx, dy = EPSILON if abs(d[0]) + abs(d[1]) < EPSILON else d[0], d[1]
         a = dx * dx + dy * dy
         # Distance from the axis by the cross product, as b^2 - ac would cancel.
         cross = o[0] * dy - o[1] * dx
@@ -127,7 +127,7 @@ def has_accent(pattern, period, x, y, z, face):
 
 
 @jit
-def is_lit(shadow, solid, point):
+def is_unshadowed(shadow, solid, point):
     """Whether a point (world frame) on a solid (-1: none) is lit by the key light."""
     x, y, z = transform(shadow.rotation.T, subtract(point, LIGHT_POSITION))
     size, focal = len(shadow.depth), single(shadow.focal)
@@ -148,7 +148,7 @@ def add_colour(solids, shadow, k, point, direction, out):
     albedo = solids.accent[k] if accent else solids.colour[k]
     normal = transform(solids.axes[k].T, local_normal)
     light = normalize(subtract(LIGHT_POSITION, point))
-    key = max(dot(normal, light), ZERO) * single(is_lit(shadow, k, point))
+    key = max(dot(normal, light), ZERO) * single(is_unshadowed(shadow, k, point))
     fill = max(dot(normal, FILL_DIRECTION), ZERO)
     highlight = max(dot(normal, normalize(subtract(light, direction))), ZERO)
     for _ in range(5):  # to the power 32
