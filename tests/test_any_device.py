@@ -219,7 +219,7 @@ def test_tools_run_of_cpu_work_on_device(device: torch.device, tmp_path: Path):
     assert fmean(view["psnr"] for view in judged["views"]) == pytest.approx(expected, abs=0.01)
 
     render(run, frames=2, channels="rgb,depth,opacity", output=tmp_path / "film.webp", device=NAME)
-    render(run, path="test", output=tmp_path / "frames", device=NAME)
+    render(run, path="test", output=tmp_path / "test_views", device=NAME)
     render(run, frames=1, background="transparent", output=tmp_path / "frames", device=NAME)
     assert (tmp_path / "film.webp").exists() and len(list((tmp_path / "frames").glob("*.png"))) == 1
 
