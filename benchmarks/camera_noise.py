@@ -77,14 +77,14 @@ def fit_similarity(points: Float[Tensor, "V 3"], truth: Float[Tensor, "V 3"]) ->
     return matrix
 
 
-def measure_camera_errors(cameras: Cameras, truth: Cameras, centre: Float[Tensor, "3"]) -> dict[str, float]:
+def measure_camera_errors(cameras: Cameras, truth: Cameras, center: Float[Tensor, "3"]) -> dict[str, float]:
     """Mean rotation error in degrees and mean position error in percent of the distance to the content, after alignment by
     a similarity, which a field cannot observe."""
     true_poses = truth.c2w.double()
     aligned = transform_poses(cameras.c2w, fit_similarity(cameras.c2w[:, :3, 3].double(), true_poses[:, :3, 3]))
     angles = [angle_between(a, b) for a, b in zip(aligned.numpy(), true_poses.numpy(), strict=True)]
     shift = (aligned - true_poses)[:, :3, 3].norm(dim=1)
-    distance = (true_poses[:, :3, 3] - centre.double()).norm(dim=1)
+    distance = (true_poses[:, :3, 3] - center.double()).norm(dim=1)
     return {"degrees": math.degrees(fmean(angles)), "moved_percent": 100 * float((shift / distance).mean())}
 
 
@@ -122,6 +122,6 @@ def train_corrupted(
     }
     return (
         figures
-        | measure_camera_errors(refined, truth.train.cameras, truth.bounds.centre)
+        | measure_camera_errors(refined, truth.train.cameras, truth.bounds.center)
         | {"misfits": len(results["misfits"])}
     )

@@ -51,10 +51,10 @@ def measure_accuracy(folder: Path, seed: int) -> list[dict[str, Any]]:
         for by, poses in groups.items():
             solution, true_poses = (sheet, truth.calibration) if by == "sheet" else (capture.solution, truth.photos)
             pairs = [(solve_home_frame(solution, layout) @ pose, true_poses[photo]) for pose, photo in poses]
-            centres = [np.linalg.norm(a[:3, 3] - b[:3, 3]) / np.linalg.norm(b[:3, 3]) for a, b in pairs]
+            centers = [np.linalg.norm(a[:3, 3] - b[:3, 3]) / np.linalg.norm(b[:3, 3]) for a, b in pairs]
             row = {"capture": name + (", hidden" if hide else ""), "method": by, "registered": len(pairs)}
             row["focal_percent"] = 100 * abs(capture.calibration.lens.fx / LENS.fx - 1)
-            row["centre_percent"] = 100 * float(np.median(centres)) if pairs else None
+            row["center_percent"] = 100 * float(np.median(centers)) if pairs else None
             row["degrees"] = float(np.degrees(np.median([angle_between(a, b) for a, b in pairs]))) if pairs else None
             rows.append({**row, "layout_mm": measure_layout_error(solution, layout)})
     return rows
@@ -66,7 +66,7 @@ def solve_home_frame(solution: PoseSolution, layout: TagLayout) -> np.ndarray:
 
 
 def measure_layout_error(solution: PoseSolution, layout: TagLayout) -> float:
-    """Largest position error of a tag, millimetres."""
+    """Largest position error of a tag, millimeters."""
     to_truth = solve_home_frame(solution, layout)
     shifts = [(to_truth @ pose)[:3, 3] - layout.poses[tag][:3, 3] for tag, pose in solution.tags.items()]
     return 1000 * max(float(np.linalg.norm(shift)) for shift in shifts)

@@ -112,7 +112,7 @@ def hash_interpolate(cells: Sequence[tuple[int, ...]], sizes: list[int], tables:
 
 
 def make_converging_rays(unbounded: bool) -> tuple[Tensor, ...]:
-    """Inputs of `march`: rays from a sphere of radius 4 toward the centre of a box, the box, near, far, jitter, and a ball
+    """Inputs of `march`: rays from a sphere of radius 4 toward the center of a box, the box, near, far, jitter, and a ball
     of occupied cells."""
     origins = 4 * normalize(torch.randn(NUM_RAYS, 3), dim=1)
     directions = normalize(0.5 * torch.randn(NUM_RAYS, 3) - origins, dim=1)
@@ -164,7 +164,7 @@ def _make_cases() -> dict[str, Case]:
     flat = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
     features = torch.rand(15, len(unit)).T
     clear = avoid_kinks(features, harmonics, layers)
-    factors, colours = VectorMatrix(128, 16), VectorMatrix(128, 16)
+    factors, colors = VectorMatrix(128, 16), VectorMatrix(128, 16)
     voxels = VoxelField(Bounds(aabb), base_resolution=64, max_resolution=64, stages=1)
     sparsify(voxels)
     rows, weights = kernels.locate_vertices(voxels.index, unit)
@@ -198,7 +198,7 @@ def _make_cases() -> dict[str, Case]:
         "plane_line_sum": Case(kernels.plane_line_sum, (factors.planes, factors.lines, unit), num_trainable=2),
         "plane_line_sum_and_products": Case(
             plane_line_sum_and_products,
-            (factors.planes, factors.lines, colours.planes, colours.lines, unit),
+            (factors.planes, factors.lines, colors.planes, colors.lines, unit),
             num_trainable=4,
         ),
         "locate_vertices": Case(kernels.locate_vertices, (voxels.index, unit), kind="rows"),

@@ -39,8 +39,8 @@ def compute_bricks_distance(points: np.ndarray) -> np.ndarray:
     inside a bound."""
     solids = load_bulldozer()
     distance = np.full(len(points), np.inf)
-    for index in range(len(solids.centre)):
-        local, half = (points - solids.centre[index]) @ solids.axes[index].T, solids.half_size[index]
+    for index in range(len(solids.center)):
+        local, half = (points - solids.center[index]) @ solids.axes[index].T, solids.half_size[index]
         if solids.is_cylinder[index]:
             beyond = np.stack([np.hypot(local[:, 0], local[:, 1]) - half[0], np.abs(local[:, 2]) - half[2]], axis=1)
         else:
@@ -77,10 +77,10 @@ def measure_bricks(seconds: float, output: Path) -> Rows:
 
 
 def get_true_box(table: Tabletop) -> np.ndarray:
-    """Bounding box [2, 3] of the object's part above `MIN_HEIGHT_M`, metres in the layout's frame."""
+    """Bounding box [2, 3] of the object's part above `MIN_HEIGHT_M`, meters in the layout's frame."""
     solids = load_bulldozer()
     extent = np.abs(solids.axes * solids.half_size[:, :, None]).sum(1)
-    corners = table.shift + table.scale * (solids.centre + np.stack([-extent, extent]))
+    corners = table.shift + table.scale * (solids.center + np.stack([-extent, extent]))
     high_enough = corners[:, corners[1, :, 2] > MIN_HEIGHT_M]
     return np.stack([high_enough[0].min(0), high_enough[1].max(0)])
 

@@ -22,7 +22,7 @@ from nerf_lightning.synthetic.objects import (
 
 SIZE, VIEWS, HELD_OUT = 128, 48, 6
 STEPS = 1500
-GREY = (0.5, 0.5, 0.5)
+GRAY = (0.5, 0.5, 0.5)
 BOXED_FRACTION = 0.3
 """Fraction of the training photos with pasted boxes."""
 FISHEYE = Distortion(k1=-0.02, k2=0.004)
@@ -84,12 +84,12 @@ def render_fisheye(views: int, phase: float) -> Views:
     K[:, 0, 0] = K[:, 1, 1] = focal
     lenses = Lenses(torch.tensor([FISHEYE]).repeat(views, 1), torch.full((views,), Projection.FISHEYE))
     cameras = Cameras(K, pinhole.c2w, pinhole.sizes, lenses)
-    return Views.from_images(render_photos(PILE, cameras, GREY), cameras)
+    return Views.from_images(render_photos(PILE, cameras, GRAY), cameras)
 
 
 def measure(args: argparse.Namespace) -> Rows:
     """Trains on each kind of photos; one row per kind."""
-    plain = replace(make_object_scene(PILE, GREY, SIZE, VIEWS, HELD_OUT), bounds=bound_primitives(PILE))
+    plain = replace(make_object_scene(PILE, GRAY, SIZE, VIEWS, HELD_OUT), bounds=bound_primitives(PILE))
     boxes, masks = paste_boxes(plain, args.seeds[0])
     fisheye = replace(plain, train=render_fisheye(VIEWS, 0.0), val=render_fisheye(HELD_OUT, 0.7))
     scenes = {

@@ -15,7 +15,7 @@ SUBPIXEL_BITS = 4
 
 
 def make_colored_noise(size: int, slope: float, generator: Generator) -> Float[np.ndarray, "H W 3"]:
-    """Coloured noise of variance 1, with amplitude proportional to frequency^-slope."""
+    """Colored noise of variance 1, with amplitude proportional to frequency^-slope."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.fftfreq(size)))
     frequency[0, 0] = np.inf  # no mean
     waves = np.fft.fft2(generator.standard_normal((3, size, size))) / frequency**slope

@@ -166,7 +166,7 @@ class Alternation(L.Callback):
 def measure_overhead(overrides: list[str]) -> dict[str, float]:
     """Milliseconds per step, plain and under a Trainer with all callbacks and the logger, in alternating blocks of one run.
 
-    Validation and snapshots are disabled; the overhead is the median over pairs of neighbouring blocks, with quartiles.
+    Validation and snapshots are disabled; the overhead is the median over pairs of neighboring blocks, with quartiles.
     """
     steps = NUM_BLOCKS * BLOCK_STEPS + 1
     settings = [

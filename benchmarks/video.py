@@ -89,7 +89,7 @@ def _render_frames(c2w: Float[np.ndarray, "N 4 4"], seed: int) -> Iterator[UInt8
 
 
 def _measure_registration(folder: Path, c2w: Float[np.ndarray, "N 4 4"], num_selected: int) -> Row:
-    """Errors of registered frames after alignment; centre errors in percent of the distance from the mean centre."""
+    """Errors of registered frames after alignment; center errors in percent of the distance from the mean center."""
     import pycolmap
 
     model = pycolmap.Reconstruction(folder)
@@ -102,13 +102,13 @@ def _measure_registration(folder: Path, c2w: Float[np.ndarray, "N 4 4"], num_sel
     camera = model.cameras[images[0].camera_id]
     return {
         "registered": f"{len(images)}/{num_selected}",
-        "centre_percent": 100 * float(np.median(np.linalg.norm(ours[:, :3, 3] - truth[:, :3, 3], axis=-1) / distance)),
+        "center_percent": 100 * float(np.median(np.linalg.norm(ours[:, :3, 3] - truth[:, :3, 3], axis=-1) / distance)),
         "degrees": float(np.degrees(np.median([angle_between(a, b) for a, b in zip(ours, truth, strict=True)]))),
         "focal_percent": 100 * abs(camera.mean_focal_length() / LENS.fx - 1),
     }
 
 
 def align_poses(poses: Float[np.ndarray, "N 4 4"], truth: Float[np.ndarray, "N 4 4"]) -> Float[np.ndarray, "N 4 4"]:
-    """Aligns camera poses by the similarity that best fits their centres to the truth."""
+    """Aligns camera poses by the similarity that best fits their centers to the truth."""
     similarity = fit_similarity(*(torch.from_numpy(p[:, :3, 3]) for p in (poses, truth)))
     return transform_poses(torch.from_numpy(poses), similarity).numpy()

@@ -1,4 +1,4 @@
-"""A custom field, here a dense grid of density and colour, trained by Lightning's Trainer.
+"""A custom field, here a dense grid of density and color, trained by Lightning's Trainer.
 
 python examples/own_field.py SCENE.npz 1000
 """
@@ -24,7 +24,7 @@ class Grid(model.Field):
         values = torch.nn.functional.grid_sample(self.grid, grid_positions[None, None, None], align_corners=True)
         return values[0, 0].flatten().exp(), values[0, 1:].flatten(1).T
 
-    def colour(self, features, directions):
+    def color(self, features, directions):
         return torch.sigmoid(features)
 
 

@@ -15,7 +15,7 @@ if __name__ == "__main__":
     parser = ArgumentParser()
     parser.add_argument("sheet", type=Path, help="folder of photos of the page of tags")
     parser.add_argument("photos", type=Path, help="folder of photos of the object with tags in view")
-    parser.add_argument("--tag", type=float, required=True, help="side of a tag's black square, metres")
+    parser.add_argument("--tag", type=float, required=True, help="side of a tag's black square, meters")
     parser.add_argument("--seconds", type=float, default=180, help="training time")
     parser.add_argument("--pixels", type=int, default=300, help="longest side of the scene's photos")
     args = parser.parse_args()

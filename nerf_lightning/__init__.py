@@ -10,8 +10,8 @@ The tree is the data flow, seven stages in order:
     sampler/    Rays become Samples: where along each ray the field is evaluated
     model/      fields: position, direction -> density, rgb; encodings; 2D fields
     kernels/    the hot loops of all of these: a plain reference, and a fast version for CPUs
-    renderer/   Samples with density and rgb become colour, opacity, depth
-    system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimiser
+    renderer/   Samples with density and rgb become color, opacity, depth
+    system/     NeRF2D and NeRF3D: LightningModules that hold step, loss, metrics, optimizer
     callbacks/  budget, divergence recovery, validation, snapshots, orbit, checkpoints, progress, results.json
     config/     command line -> configuration -> objects; build.py is the only place that instantiates
     training/   one run, from a configuration to the files in its folder; sweeps: many runs from one command line
@@ -24,7 +24,7 @@ are known to fail, on scenes of synthetic/). What they all draw with is in drawi
 
 Axis letters, the same everywhere: V views, H W pixels, C channels, R rays, S samples a ray, N packed samples
 (or points), L levels or frequencies, F features. Cameras follow OpenCV: x right, y down, z forward; `c2w` maps camera
-to world; pixel centres lie at +0.5. Lengths are in the scene's own unit, colours are sRGB in [0, 1].
+to world; pixel centers lie at +0.5. Lengths are in the scene's own unit, colors are sRGB in [0, 1].
 """
 
 from typing import TYPE_CHECKING, Any

@@ -60,7 +60,7 @@ class View:
     """A rendered view on the run's background."""
 
     rgb: Float[Tensor, "H W 3"]
-    """Colours in [0, 1]."""
+    """Colors in [0, 1]."""
     opacity: Float[Tensor, "H W"]
     depth: Float[Tensor, "H W"]
     """Mean distance along the ray, in scene units."""

@@ -85,12 +85,12 @@ VARIANTS = {
         name: [*(one for one in SCENE if not one.startswith("sampler.")), "model=mlp", "model.width=16", *given]
         for name, given in SAMPLERS.items()
     },
-    "penalty, one colour behind": [
+    "penalty, one color behind": [
         *small_options("hashgrid"),
         "renderer.distortion_loss_weight=0.01",
         "renderer.background=white",
     ],
-    "random colours behind": [*small_options("tensorf"), "renderer.background=random"],
+    "random colors behind": [*small_options("tensorf"), "renderer.background=random"],
 }
 
 
@@ -112,7 +112,7 @@ def test_training_steps_on_device_match_cpu(
 
 
 MAX_OPERATIONS = {"tensorf": 256, "hashgrid": 255, "voxels": 258, "mlp": 227}
-"""Operations a step between two updates of the sampler: forward, backward, optimiser. Each takes 5 to 10 microseconds."""
+"""Operations a step between two updates of the sampler: forward, backward, optimizer. Each takes 5 to 10 microseconds."""
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ K1, STEPS = 0.02, 12
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """16 photos on grey: every second is twice as wide as high; a box is masked in every third."""
+    """16 photos on gray: every second is twice as wide as high; a box is masked in every third."""
     root = tmp_path_factory.mktemp("capture")
     cameras = make_hemisphere_cameras(16, 24)
     lenses = Lenses(torch.tensor([Distortion(K1)]).repeat(16, 1), torch.full((16,), Projection.FISHEYE))

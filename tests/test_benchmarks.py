@@ -22,16 +22,16 @@ from tests.helpers.soft_ball import make_ball_cameras
 
 
 def test_camera_errors_common_motion_does_not_count():
-    truth, centre = make_ball_cameras(6, 8), torch.zeros(3)
+    truth, center = make_ball_cameras(6, 8), torch.zeros(3)
     turn = torch.linalg.matrix_exp(torch.tensor([[0.0, -0.4, 0.1], [0.4, 0.0, 0.2], [-0.1, -0.2, 0.0]]))
     elsewhere = torch.eye(4)
     elsewhere[:3, :3], elsewhere[:3, 3] = 1.7 * turn, torch.tensor([1.0, -2.0, 0.5])
     together = replace(truth, c2w=transform_poses(truth.c2w, elsewhere).float())
-    assert max(camera_noise.measure_camera_errors(together, truth, centre).values()) < 0.1
+    assert max(camera_noise.measure_camera_errors(together, truth, center).values()) < 0.1
     c2w = truth.c2w.clone()
     angle = torch.tensor(0.1)
     c2w[2, :3, :2] = c2w[2, :3, :2] @ torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
-    found = camera_noise.measure_camera_errors(replace(truth, c2w=c2w), truth, centre)
+    found = camera_noise.measure_camera_errors(replace(truth, c2w=c2w), truth, center)
     assert found["degrees"] == pytest.approx(math.degrees(0.1) / 6, rel=1e-2) and found["moved_percent"] < 0.01
 
 

@@ -22,7 +22,7 @@ from nerf_lightning.synthetic.objects import trace_rays
 from nerf_lightning.synthetic.rooms import make_subject, make_walls
 from nerf_lightning.utils.device import CPU
 from tests.cameras.test_equirectangular import panoramas
-from tests.helpers.ball_runs import CENTRE, RADIUS, make_ball_run
+from tests.helpers.ball_runs import CENTER, RADIUS, make_ball_run
 
 WIDTH, HEIGHT, STEPS = 64, 32, 80
 ROOM = [*make_subject(0.5, 2.0), *make_walls(3.0, -0.5, 2.5, 0.6, 0.8)]
@@ -44,8 +44,8 @@ def render_photos(c2w: torch.Tensor) -> torch.Tensor:
     latitude = ((torch.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT) - 0.5)[:, None] * math.pi
     right, down, ahead = longitude.sin() * latitude.cos(), latitude.sin(), longitude.cos() * latitude.cos()
     local = torch.stack([right, down.expand_as(right), ahead], dim=2).view(-1, 3)
-    colours, _, _ = trace_rays(ROOM, Rays(c2w[:3, 3].expand_as(local), local @ c2w[:3, :3].T))
-    return (colours.view(HEIGHT, 2, WIDTH, 2, 3).mean((1, 3)).clamp(0, 1) * 255).round().to(torch.uint8)
+    colors, _, _ = trace_rays(ROOM, Rays(c2w[:3, 3].expand_as(local), local @ c2w[:3, :3].T))
+    return (colors.view(HEIGHT, 2, WIDTH, 2, 3).mean((1, 3)).clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 def render_views(count: int, seed: int) -> Views:
@@ -86,15 +86,15 @@ def test_panoramas_room_trains_and_exports(scene: Scene, tmp_path: Path):
 
 def test_mesh_from_panoramas_sees_all_directions():
     run = make_ball_run(torch.eye(4, dtype=torch.float64))
-    around = make_circle_poses(CENTRE, UP, 3.0, 0.6, 6)
+    around = make_circle_poses(CENTER, UP, 3.0, 0.6, 6)
     away = torch.diag(torch.tensor([-1.0, 1, -1, 1]))  # the ball lies on the seam of half of them
-    c2w = torch.cat([around, make_circle_poses(CENTRE, UP, 3.0, -0.6, 6) @ away])
+    c2w = torch.cat([around, make_circle_poses(CENTER, UP, 3.0, -0.6, 6) @ away])
     shape = build_mesh_file(run, panoramas(c2w, 160, 80), sample_volume(run, 32), None, ".ply")
     assert "watertight" in shape.description and "floating" not in shape.description
     vertices = np.frombuffer(
         shape.content.split(b"end_header\n")[1], np.dtype([("v", "<f8", 3), ("rgb", "u1", 3)]), 100
     )["v"]
-    assert np.abs(np.linalg.norm(vertices - CENTRE.numpy(), axis=1) - RADIUS).max() < 0.1
+    assert np.abs(np.linalg.norm(vertices - CENTER.numpy(), axis=1) - RADIUS).max() < 0.1
 
 
 def test_write_photos_panoramas_name_projection(scene: Scene, tmp_path: Path):

@@ -39,7 +39,7 @@ class Truth:
     lens: Intrinsics
     layout: TagLayout
     calibration: dict[str, Float[np.ndarray, "4 4"]]
-    """Camera to world, metres, by file name, of the photos of the sheet alone."""
+    """Camera to world, meters, by file name, of the photos of the sheet alone."""
     photos: dict[str, Float[np.ndarray, "4 4"]]
     """The same of the photos of the object."""
 
@@ -62,7 +62,7 @@ def render_photo(
     Args:
         layout: tags lying in the plane z = 0.
         lens: with or without distortion.
-        c2w: the camera, above the table; metres.
+        c2w: the camera, above the table; meters.
         with_object: whether the bulldozer stands on the table.
         flaws: blur and noise added to the exact image.
         seed: of the noise.

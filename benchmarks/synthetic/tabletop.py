@@ -7,26 +7,26 @@ from jaxtyping import Bool, Float, Int
 
 from nerf_lightning.capture.tags.detect import get_dictionary
 from nerf_lightning.capture.tags.tag_layout import TagLayout
-from nerf_lightning.kernels.cpu.solids import add_colour, dot, entry_distance, is_unshadowed, subtract, transform
+from nerf_lightning.kernels.cpu.solids import add_color, dot, entry_distance, is_unshadowed, subtract, transform
 from nerf_lightning.synthetic.solids import Solids, load_bulldozer
 from nerf_lightning.synthetic.tracer import render_shadow_map
 
 INK, PAPER, WALL = 0.09, 0.90, 0.75
-"""Grey levels, sRGB."""
+"""Gray levels, sRGB."""
 WOOD, GRAIN = np.array([0.56, 0.44, 0.33]), np.array([0.10, 0.10, 0.09])
-"""Colour of the table, sRGB, and the amplitude of its texture."""
+"""Color of the table, sRGB, and the amplitude of its texture."""
 TABLE_MARGIN_M = 0.3
 """Width of the table around the paper."""
 OBJECT_LENGTH_M = 0.12
 """Length of the bulldozer along the world's y axis."""
 SHADOW_BRIGHTNESS = 0.65
-"""Factor of the ground's sRGB colour in the bulldozer's shadow."""
+"""Factor of the ground's sRGB color in the bulldozer's shadow."""
 
 
 class Tabletop:
-    """A table in the plane z = 0, z up, metres, with tags lying on it; beyond its edge there is a grey wall at infinity.
+    """A table in the plane z = 0, z up, meters, with tags lying on it; beyond its edge there is a gray wall at infinity.
 
-    The bulldozer stands at the centre of the tags, or next to the paper if it would cover more than half of them. `hidden`:
+    The bulldozer stands at the center of the tags, or next to the paper if it would cover more than half of them. `hidden`:
     a blank sheet covers the tags.
     """
 
@@ -49,7 +49,7 @@ class Tabletop:
 
         low, high = load_bulldozer().aabb
         self.scale = OBJECT_LENGTH_M / (high[1] - low[1])
-        """Metres per unit of the bulldozer's frame, which is translated but not rotated."""
+        """Meters per unit of the bulldozer's frame, which is translated but not rotated."""
         size = self.scale * (high - low)
         spot = self.middle
         low_spot, high_spot = spot - size[:2] / 2, spot + size[:2] / 2
@@ -133,7 +133,7 @@ class Tabletop:
 
 
 def _wood_color(points: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 3"]:
-    """Smooth grain along x, with no wave shorter than 2 cm, so that pixels of a few millimetres do not alias."""
+    """Smooth grain along x, with no wave shorter than 2 cm, so that pixels of a few millimeters do not alias."""
     x, y = points.T
     warped_y = y + 0.018 * np.sin(17 * x + 9 * y) + 0.007 * np.sin(43 * x - 31 * y)
     wave = 0.5 * np.sin(150 * warped_y) + 0.3 * np.sin(89 * warped_y + 7 * x + 1) + 0.2 * np.sin(60 * x + 70 * y + 2)
@@ -147,7 +147,7 @@ def _cull_to_cone(
     axis = directions.mean(0)
     axis /= np.linalg.norm(axis)
     half_angle = np.arccos(np.clip((directions @ axis).min(), -1, 1))
-    offset = solids.centre - origin
+    offset = solids.center - origin
     distance = np.linalg.norm(offset, axis=-1)
     angular_radius = np.arcsin(np.clip(np.linalg.norm(solids.half_size, axis=-1) / distance, 0, 1))
     axis_angle = np.arccos(np.clip(offset @ axis / distance, -1, 1))
@@ -179,8 +179,8 @@ compiled = numba.njit(cache=True, nogil=True, error_model="numpy")
 def _find_nearest(solids, to_unit, origins, directions, solid, t):
     for ray in range(len(t)):
         d = directions[ray]
-        for k in range(len(solids.centre)):
-            offset, half = subtract(origins[ray], solids.centre[k]), solids.half_size[k]
+        for k in range(len(solids.center)):
+            offset, half = subtract(origins[ray], solids.center[k]), solids.half_size[k]
             # Only if the ray intersects the bounding sphere.
             if dot(offset, offset) - dot(offset, d) ** 2 / dot(d, d) < 1.0001 * dot(half, half):
                 distance = entry_distance(
@@ -193,7 +193,7 @@ def _find_nearest(solids, to_unit, origins, directions, solid, t):
 @compiled
 def _shade_points(solids, shadow, solid, points, directions, rgb):
     for n in range(len(points)):
-        add_colour(solids, shadow, solid[n], points[n], directions[n], rgb[n])
+        add_color(solids, shadow, solid[n], points[n], directions[n], rgb[n])
 
 
 @compiled

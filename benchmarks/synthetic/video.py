@@ -23,15 +23,15 @@ FPS = 30
 def place_cameras(layout: TagLayout, lens: Intrinsics, count: int) -> Float[np.ndarray, "count 4 4"]:
     """Camera-to-world poses of a smooth turn around the bulldozer, with varying height and distance."""
     top = Tabletop(layout)
-    centre = top.box.mean(0)
+    center = top.box.mean(0)
     radius = float(np.linalg.norm(top.box[1] - top.box[0])) / 2
     turns = 2 * np.pi * np.arange(count) / count
     elevation = np.radians(42 + 14 * np.sin(2 * turns))
     distance = radius * 2.4 * lens.fx / lens.height * (1 + 0.12 * np.cos(3 * turns))
     ring = np.cos(elevation)
-    eye = centre + distance[:, None] * np.stack([ring * np.cos(turns), ring * np.sin(turns), np.sin(elevation)], -1)
+    eye = center + distance[:, None] * np.stack([ring * np.cos(turns), ring * np.sin(turns), np.sin(elevation)], -1)
     up = torch.tensor([0.0, 0.0, 1.0]).double()
-    return look_at(torch.from_numpy(eye), torch.from_numpy(centre), up).numpy()
+    return look_at(torch.from_numpy(eye), torch.from_numpy(center), up).numpy()
 
 
 def blur_image(

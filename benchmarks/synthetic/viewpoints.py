@@ -24,15 +24,15 @@ ELEVATION_RANGE_DEG = (28.0, 68.0)
 
 
 def make_sheet_cameras(layout: TagLayout, lens: Intrinsics, count: int, seed: int) -> Float[np.ndarray, "count 4 4"]:
-    """Calibration poses, camera to world, metres: every photo shows all tags, in varying parts of the frame.
+    """Calibration poses, camera to world, meters: every photo shows all tags, in varying parts of the frame.
 
     Tilts of up to 45 degrees in all directions, any roll, distances from the minimum to a third farther.
     """
     rng = np.random.default_rng(seed)
     # With the white margin that detectors need.
     tags = np.concatenate([1.4 * layout.corners(tag) - 0.4 * layout.poses[tag][:3, 3] for tag in layout.poses])
-    centre = (tags.min(0) + tags.max(0)) / 2
-    # The frame's centre, corners and sides, the corners twice as often: there distortion is largest.
+    center = (tags.min(0) + tags.max(0)) / 2
+    # The frame's center, corners and sides, the corners twice as often: there distortion is largest.
     goals = np.array([(0, 0), (-1, -1), (1, 1), (1, -1), (-1, 1), (0, -1), (0, 1), (-1, -1), (1, 1), (1, -1), (-1, 1)])
     start, out = rng.random(2), []
     for i in range(count):
@@ -44,13 +44,13 @@ def make_sheet_cameras(layout: TagLayout, lens: Intrinsics, count: int, seed: in
         near, far = 0.1 * layout.size, 1e3 * layout.size
         for _ in range(40):
             middle = np.sqrt(near * far)
-            fits = is_in_frame(lens, _orbit_pose(centre, middle * direction, roll), tags).all()
+            fits = is_in_frame(lens, _orbit_pose(center, middle * direction, roll), tags).all()
             near, far = (near, middle) if fits else (middle, far)
-        c2w = _orbit_pose(centre, spread * far * direction, roll)
+        c2w = _orbit_pose(center, spread * far * direction, roll)
         # As far toward the goal as keeps all tags in the frame.
         goal = (goals[i % len(goals)] + 1) / 2 * (lens.width, lens.height)
         middle_pixel = np.array([lens.cx, lens.cy])
-        aimed = (_aim_camera(lens, c2w, centre, (1 - s) * middle_pixel + s * goal) for s in np.linspace(1, 0, 41))
+        aimed = (_aim_camera(lens, c2w, center, (1 - s) * middle_pixel + s * goal) for s in np.linspace(1, 0, 41))
         out.append(next((pose for pose in aimed if is_in_frame(lens, pose, tags).all()), c2w))
     return np.array(out)
 
@@ -58,7 +58,7 @@ def make_sheet_cameras(layout: TagLayout, lens: Intrinsics, count: int, seed: in
 def make_object_cameras(
     layout: TagLayout, lens: Intrinsics, count: int, seed: int, steps: int | None = None
 ) -> Float[np.ndarray, "count 4 4"]:
-    """Poses around the bulldozer, camera to world, metres, at varying heights and distances; `steps` (None: `count`) per turn.
+    """Poses around the bulldozer, camera to world, meters, at varying heights and distances; `steps` (None: `count`) per turn.
 
     Every photo shows all of the bulldozer and two visible tags (one if there is only one).
 
@@ -69,9 +69,9 @@ def make_object_cameras(
     top = Tabletop(layout)
     box = np.array(list(itertools.product(*top.box.T)))
     sheet = np.append(top.middle, 0.0)
-    # Between the object and the sheet; above the sheet's centre if the object stands there.
-    centre = (top.box.mean(0) + sheet) / 2
-    radius = float(np.linalg.norm(box - centre, axis=-1).max())
+    # Between the object and the sheet; above the sheet's center if the object stands there.
+    center = (top.box.mean(0) + sheet) / 2
+    radius = float(np.linalg.norm(box - center, axis=-1).max())
     start, out = rng.random(), []
     for i in range(count):
         near = 1.0
@@ -85,9 +85,9 @@ def make_object_cameras(
             height = (start + i * GOLDEN_RATIO + (0.1 + 0.01 * attempt) * rng.uniform(-1, 1)) % 1
             elevation = np.radians(ELEVATION_RANGE_DEG[0] + (ELEVATION_RANGE_DEG[1] - ELEVATION_RANGE_DEG[0]) * height)
             distance = near * rng.uniform(1.0, 1.4) * radius * 2 * max(lens.fx, lens.fy) / min(lens.width, lens.height)
-            c2w = _orbit_pose(centre, distance * _direction(azimuth, elevation), np.radians(rng.normal(0, 6)))
+            c2w = _orbit_pose(center, distance * _direction(azimuth, elevation), np.radians(rng.normal(0, 6)))
             pixel = np.array([lens.cx, lens.cy]) + rng.uniform(-0.06, 0.06, 2) * (lens.width, lens.height)
-            c2w = _aim_camera(lens, c2w, centre, pixel)
+            c2w = _aim_camera(lens, c2w, center, pixel)
             if is_in_frame(lens, c2w, box).all() and len(find_visible_tags(top, lens, c2w)) >= min(
                 2, len(layout.poses)
             ):
@@ -131,11 +131,11 @@ def _direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:
 
 
 def _orbit_pose(
-    centre: Float[np.ndarray, "3"], offset: Float[np.ndarray, "3"], roll: float
+    center: Float[np.ndarray, "3"], offset: Float[np.ndarray, "3"], roll: float
 ) -> Float[np.ndarray, "4 4"]:
-    """Camera at `centre + offset` that looks at `centre`, rolled about its optical axis."""
+    """Camera at `center + offset` that looks at `center`, rolled about its optical axis."""
     up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-    c2w = look_at(torch.from_numpy(centre + offset), torch.from_numpy(centre), up).numpy()
+    c2w = look_at(torch.from_numpy(center + offset), torch.from_numpy(center), up).numpy()
     return _rotate_camera(c2w, np.array([0.0, 0.0, roll]))
 
 

@@ -34,7 +34,7 @@ class Budget(L.Callback):
     with it, runs to the end.
 
     Args:
-        steps: optimiser steps, or None.
+        steps: optimizer steps, or None.
         seconds: seconds of training, or None.
         patience: dB that 50 % more time must still gain; None spends the whole budget.
 

@@ -38,7 +38,7 @@ class Recovery:
 class DivergenceRecovery(L.Callback):
     """Detects diverged or stalled training and restarts it with one change.
 
-    Detects loss or weights that are not finite; a loss that rose and stays high; a loss stuck at that of a constant colour,
+    Detects loss or weights that are not finite; a loss that rose and stays high; a loss stuck at that of a constant color,
     because there is no density, density everywhere, or no gradient (see `LossMonitor`). It then restores the last good weights
     with a lower learning rate. If there are none yet, it restarts with fresh weights, and with softplus in place of a ReLU that
     can die, or else a lower learning rate. Before the first step it caps the learning rate at the field's known maximum. Each
@@ -50,7 +50,7 @@ class DivergenceRecovery(L.Callback):
     Args:
         max_restarts: most restarts; 0 turns it off.
         every: steps between checks.
-        patience: steps within which the loss must fall below that of a constant colour, or at least fall.
+        patience: steps within which the loss must fall below that of a constant color, or at least fall.
         snapshot_every: steps between copies of good weights.
     """
 
@@ -201,7 +201,7 @@ class DivergenceRecovery(L.Callback):
         fresh = copy.deepcopy(system.field).cpu()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(step_generator(system.seed, Stream.RESTART, step).initial_seed() & 0xFFFFFFFF))
-            for module in reversed(list(fresh.modules())):  # layers first: a field may initialise some of them itself
+            for module in reversed(list(fresh.modules())):  # layers first: a field may initialize some of them itself
                 if reset := getattr(module, "reset_parameters", None):
                     reset()
         system.field.load_state_dict(fresh.state_dict())

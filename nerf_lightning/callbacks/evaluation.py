@@ -45,7 +45,7 @@ class Evaluation(RenderingCallback):
         self.metrics: dict[str, Any] = dict.fromkeys(RESULT_KEYS)
         """For results.json; None if not measured, or not yet."""
         self.view_metrics: list[dict[str, float]] = []
-        """PSNR, SSIM, render seconds and constant-colour PSNR of each held-out view."""
+        """PSNR, SSIM, render seconds and constant-color PSNR of each held-out view."""
         self.photo_psnrs: list[float] = []
         """PSNR of the training photos; empty for a picture."""
         self._row_fraction = 1.0  # of each held-out view, measured

@@ -7,13 +7,13 @@ from itertools import pairwise
 EMA_DECAY = 0.96
 """Decay of the loss's running mean: about 25 steps."""
 LEARNED_RATIO = 0.85
-"""A field has learned the scene once its loss is below this multiple of the constant-colour loss."""
+"""A field has learned the scene once its loss is below this multiple of the constant-color loss."""
 STALL_RATIO, SLOW_RATIO = 0.98, 0.9
-"""Stalled: loss / earlier loss is above this, if below the constant-colour loss, and if above it."""
+"""Stalled: loss / earlier loss is above this, if below the constant-color loss, and if above it."""
 DIVERGED_RATIO, DIVERGED_CHECKS = 4.0, 3
 """Diverged: the loss is above this multiple of its minimum, at this many consecutive checks ..."""
 WORSE_RATIO, HALF_LEARNED_RATIO = 1.1, 0.3
-"""... or stays above the first multiple of its minimum and the second of the constant-colour loss."""
+"""... or stays above the first multiple of its minimum and the second of the constant-color loss."""
 EMPTY_OPACITY, FULL_OPACITY = 1e-3, 0.999
 """Mean ray opacity below which there is no density, and above which it is everywhere."""
 
@@ -46,8 +46,8 @@ class LossMonitor:
 
     Args:
         every: steps between checks.
-        patience: steps within which the loss must fall below that of a constant colour, or at least fall.
-        constant_color_loss: the loss of a constant colour.
+        patience: steps within which the loss must fall below that of a constant color, or at least fall.
+        constant_color_loss: the loss of a constant color.
     """
 
     def __init__(self, every: int, patience: int, constant_color_loss: float = 0.0):
@@ -65,7 +65,7 @@ class LossMonitor:
 
     @property
     def has_learned(self) -> bool:
-        """Whether the field has learned more than a constant colour."""
+        """Whether the field has learned more than a constant color."""
         loss = self.history.ema_loss
         return loss is not None and loss < LEARNED_RATIO * self.constant_color_loss
 
@@ -115,20 +115,20 @@ class LossMonitor:
             WORSE_RATIO * min_loss, HALF_LEARNED_RATIO * self.constant_color_loss
         ):
             ratio = min_loss / self.constant_color_loss
-            return f"the loss fell to {ratio:.2f} times that of a constant colour, and has stayed above that since"
+            return f"the loss fell to {ratio:.2f} times that of a constant color, and has stayed above that since"
         return ""
 
     def _stall_cause(self, loss: float, is_window_full: bool, opacity: float | None) -> str:
         """Describes a stall; "" if the field learns, or training has only just begun."""
         if self.has_learned or not self.constant_color_loss:
-            return ""  # a scene of one colour needs nothing else
+            return ""  # a scene of one color needs nothing else
         check_losses = self.history.check_losses
         if self.history.num_dead_checks < 2:  # without a gradient, waiting does not help
             is_falling = all(after < before for before, after in pairwise(check_losses))
             max_ratio = SLOW_RATIO if loss > self.constant_color_loss and not is_falling else STALL_RATIO
             if not is_window_full or loss < max_ratio * check_losses[0]:
                 return ""
-        stuck = f"the loss is stuck at {loss / self.constant_color_loss:.2f} times that of a constant colour"
+        stuck = f"the loss is stuck at {loss / self.constant_color_loss:.2f} times that of a constant color"
         if opacity is not None and opacity < EMPTY_OPACITY:
             return f"there is no density anywhere, so no gradient comes back; {stuck}"
         if self.history.num_dead_checks:

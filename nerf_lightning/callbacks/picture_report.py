@@ -43,7 +43,7 @@ def plot_error_map(rgb: Float[Tensor, "H W 3"], truth: Float[Tensor, "H W 3"], t
     edges = (-0.5, width - 0.5, height - 0.5, -0.5)
     shown = axes.imshow(downsample(error), extent=edges, vmin=0, vmax=top, cmap="inferno")
     axes.set(title=title, xlabel="column, pixels", ylabel="row, pixels")
-    figure.colorbar(shown, ax=axes, label="absolute error, mean over colours, 1/255", shrink=0.8)
+    figure.colorbar(shown, ax=axes, label="absolute error, mean over colors, 1/255", shrink=0.8)
     return figure
 
 

@@ -24,9 +24,9 @@ from nerf_lightning.utils.files import nan_to_none
 from nerf_lightning.utils.machine import describe_machine
 
 MIN_GAIN_DB = 1.0
-"""A run has learned nothing if it is less than this many dB better than a constant colour ..."""
+"""A run has learned nothing if it is less than this many dB better than a constant color ..."""
 TRIVIAL_SCENE_DB = 40.0
-"""... unless it reaches this PSNR: then one colour may be all there is to learn."""
+"""... unless it reaches this PSNR: then one color may be all there is to learn."""
 OVERFIT_GAP_DB = 8.0
 """A field overfits its photos if held-out views are this many dB worse than training photos ..."""
 GOOD_PSNR_DB = 30.0
@@ -109,7 +109,7 @@ def diagnose_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> 
     view = get_datamodule(trainer).get_held_out_view(0).to(system.device)
     if held_out_psnr < min_useful_psnr:
         diagnosis = (
-            f"held-out PSNR {held_out_psnr:.2f} dB is no better than a constant colour ({constant_color_psnr:.2f} dB)"
+            f"held-out PSNR {held_out_psnr:.2f} dB is no better than a constant color ({constant_color_psnr:.2f} dB)"
         )
         return "collapsed", ": ".join(filter(None, (diagnosis, system.diagnose(view))))
     status = "stopped_early" if Budget.find(trainer).progress(trainer.global_step) < 1.0 else "finished"
@@ -122,7 +122,7 @@ def diagnose_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> 
     off_grid_psnr = system.measure_off_grid_psnr(view)
     if off_grid_psnr is not None and off_grid_psnr < min_useful_psnr:
         return status, (
-            f"off the pixel grid the field is no better than a constant colour ({off_grid_psnr:.1f} dB):"
+            f"off the pixel grid the field is no better than a constant color ({off_grid_psnr:.1f} dB):"
             " it holds frequencies that the pixels do not show"
         )
     return status, ""

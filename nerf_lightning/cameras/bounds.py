@@ -36,7 +36,7 @@ class Bounds(TensorDataclass):
     pixel_footprint: float | None = None
     """Footprint of a photo's pixel at the content, world units; None if unknown."""
 
-    centre: Float[Tensor, "3"] = field(init=False, repr=False)
+    center: Float[Tensor, "3"] = field(init=False, repr=False)
     half_size: Float[Tensor, "3"] = field(init=False, repr=False)
     max_half_size: float = field(init=False, repr=False)
     _low: Float[Tensor, "3"] = field(init=False, repr=False)
@@ -44,9 +44,9 @@ class Bounds(TensorDataclass):
 
     def __post_init__(self) -> None:
         with torch.inference_mode(False):  # they enter autograd even if created in inference mode
-            centre, half_size = self.aabb.mean(0), (self.aabb[1] - self.aabb[0]) / 2
-            derived = {"centre": centre, "half_size": half_size, "max_half_size": float(half_size.max())}
-            for name, value in (derived | {"_low": centre - half_size, "_size": 2 * half_size}).items():
+            center, half_size = self.aabb.mean(0), (self.aabb[1] - self.aabb[0]) / 2
+            derived = {"center": center, "half_size": half_size, "max_half_size": float(half_size.max())}
+            for name, value in (derived | {"_low": center - half_size, "_size": 2 * half_size}).items():
                 object.__setattr__(self, name, value)
 
     @property
@@ -72,18 +72,18 @@ class Bounds(TensorDataclass):
         """Maps world positions to [0, 1]^3, beyond it outside a bounded box; contracts those of an unbounded scene into it."""
         if not self.unbounded:
             return (positions - self._low).div_(self._size)
-        local = (positions - self.centre) / self.half_size
+        local = (positions - self.center) / self.half_size
         norm = local.abs().amax(-1, keepdim=True).clamp_min(1.0)
         return (2.0 - 1.0 / norm) * (local / norm) * 0.25 + 0.5
 
     def to_world(self, unit: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Inverse of `to_unit`."""
         if not self.unbounded:
-            return (unit * 2 - 1) * self.half_size + self.centre
+            return (unit * 2 - 1) * self.half_size + self.center
         contracted = (unit - 0.5) * 4
         norm = contracted.abs().amax(-1, keepdim=True)
         outside = contracted / (norm * (2.0 - norm).clamp_min(1e-6)).clamp_min(1e-6)
-        return torch.where(norm <= 1, contracted, outside) * self.half_size + self.centre
+        return torch.where(norm <= 1, contracted, outside) * self.half_size + self.center
 
     def near_far(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R"]]:
         """Near and far distance of each ray; near >= far if it misses.
@@ -106,9 +106,9 @@ class Bounds(TensorDataclass):
         return crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)
 
     def content_interval(self, rays: Rays) -> Float[Tensor, "R 2"]:
-        """Entry and exit distance of each ray; if it misses, twice that nearest to the box's centre. May be negative."""
+        """Entry and exit distance of each ray; if it misses, twice that nearest to the box's center. May be negative."""
         enter, leave = self._intersect_aabb(rays)
-        closest = ((self.centre - rays.origins) * rays.directions).sum(-1)
+        closest = ((self.center - rays.origins) * rays.directions).sum(-1)
         return torch.stack([torch.where(enter < leave, end, closest) for end in (enter, leave)], dim=-1)
 
     def s_to_t(

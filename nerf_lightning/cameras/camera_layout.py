@@ -16,7 +16,7 @@ MIN_CONVERGENCE = 0.4
 MAX_PARALLEL_VARIANCE = 1e-5
 """Circular variance below which axes count as parallel: within a quarter of a degree."""
 MAX_PAN_SPREAD_RATIO = 0.05
-"""Largest spread of the centres of a pan, relative to the median depth."""
+"""Largest spread of the centers of a pan, relative to the median depth."""
 MAX_FORWARD_SPREAD_RATIO = 1.5
 """Largest spread of forward-facing cameras, relative to the median depth; wider ones do not share a subject."""
 SINGLE_PRECISION_EPS, DOUBLE_PRECISION_EPS = 5e-7, 1e-12
@@ -34,23 +34,23 @@ class CameraLayout(StrEnum):
     FORWARD = "forward"
     """From one side: axes nearly parallel, converging or slightly diverging."""
     PAN = "pan"
-    """Rotating on the spot, as on a tripod: centres coincide. A single camera, too."""
+    """Rotating on the spot, as on a tripod: centers coincide. A single camera, too."""
     WALK = "walk"
     """Anything else: walks through rooms, streets, fly-throughs."""
 
 
 def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | None = None) -> CameraLayout:
-    """Classifies camera poses (OpenCV, camera to world).
+    """Classifies camera poses as inward, forward, pan or walk (see `CameraLayout`).
 
-    Poses alone do not give the depth of the scene: without points, a pan whose centre moves is a walk.
+    Poses alone do not give the depth of the scene: without points, a pan whose center moves is a walk.
 
     Args:
-        c2w: at least one pose; the result is invariant to similarities.
+        c2w: at least one pose, OpenCV, camera to world; the result is invariant to similarities.
         points: surface points in the poses' frame, for the depth.
     """
     c2w = c2w.double()
-    centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
-    spread = centre_spread(c2w)
+    centers, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
+    spread = center_spread(c2w)
     if spread == 0:
         return CameraLayout.PAN
     depth = None if points is None else median_depth(c2w, points)
@@ -58,7 +58,7 @@ def classify_layout(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"] | 
         return CameraLayout.PAN
     if circular_variance(axes) <= MAX_FORWARD_VARIANCE:
         too_wide = depth is not None and spread > MAX_FORWARD_SPREAD_RATIO * depth
-        return CameraLayout.WALK if too_wide or is_dolly(centres, axes) else CameraLayout.FORWARD
+        return CameraLayout.WALK if too_wide or is_dolly(centers, axes) else CameraLayout.FORWARD
     return CameraLayout.WALK if find_convergence(c2w) is None else CameraLayout.INWARD
 
 
@@ -67,14 +67,14 @@ def circular_variance(directions: Float[Tensor, "V 3"]) -> float:
     return 1 - float(directions.mean(0).norm())
 
 
-def centre_spread(c2w: Float[Tensor, "V 4 4"]) -> float:
-    """Median distance of the camera centres from their median; 0 if they differ by rounding alone."""
-    centres = c2w[:, :3, 3].double()
-    distance = (centres - centres.median(0).values).norm(dim=1)
+def center_spread(c2w: Float[Tensor, "V 4 4"]) -> float:
+    """Median distance of the camera centers from their median; 0 if they differ by rounding alone."""
+    centers = c2w[:, :3, 3].double()
+    distance = (centers - centers.median(0).values).norm(dim=1)
     spread = float(distance.median()) or float(distance.mean())
-    is_single = bool((centres == centres.float()).all())
+    is_single = bool((centers == centers.float()).all())
     rounding = SINGLE_PRECISION_EPS if is_single else DOUBLE_PRECISION_EPS
-    return spread if spread > rounding * float(centres.abs().max()) else 0.0
+    return spread if spread > rounding * float(centers.abs().max()) else 0.0
 
 
 def median_depth(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> float | None:
@@ -90,9 +90,9 @@ def median_depth(c2w: Float[Tensor, "V 4 4"], points: Float[Tensor, "P 3"]) -> f
     return float(torch.stack(depths).median()) if depths else None
 
 
-def is_dolly(centres: Float[Tensor, "V 3"], axes: Float[Tensor, "V 3"]) -> bool:
-    """True if camera centres spread along the mean axis more than across it."""
-    offset = centres - centres.mean(0)
+def is_dolly(centers: Float[Tensor, "V 3"], axes: Float[Tensor, "V 3"]) -> bool:
+    """True if camera centers spread along the mean axis more than across it."""
+    offset = centers - centers.mean(0)
     axial = offset @ normalize(axes.mean(0), dim=0)
     return bool(2 * axial.square().sum() > offset.square().sum())
 
@@ -103,7 +103,7 @@ def find_convergence(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"] | None:
     Score: 1 - mean(1 - cos(angle between axis and point)) / (circular variance of the axes), at least `MIN_CONVERGENCE`.
     """
     variance = circular_variance(normalize(c2w[:, :3, 2].double(), dim=1))
-    if centre_spread(c2w) == 0 or variance < MAX_PARALLEL_VARIANCE:
+    if center_spread(c2w) == 0 or variance < MAX_PARALLEL_VARIANCE:
         return None
     target = find_focus_point(c2w)
     return target if 1 - (1 - float(axis_cosines(c2w, target[None])[0].mean())) / variance >= MIN_CONVERGENCE else None
@@ -119,21 +119,21 @@ def find_focus_point(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "3"]:
     """The focus point: nearest to all camera axes by angle; far away if the axes do not converge.
 
     Maximizes the mean cosine between axes and directions to the point, with views weighted by the inverse density of
-    viewing directions. For a ring of cameras that all frame the subject to one side, that is the ring's centre.
+    viewing directions. For a ring of cameras that all frame the subject to one side, that is the ring's center.
     """
     c2w = c2w.double().clone()
     middle = c2w[:, :3, 3].mean(0)
     size = float((c2w[:, :3, 3] - middle).norm(dim=1).mean()) or 1.0
     c2w[:, :3, 3] = (c2w[:, :3, 3] - middle) / size
-    centres, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
-    candidates = [centres + reach * axes for reach in (0.5, 1.0, 2.0, 4.0)]
-    start = torch.cat([torch.zeros_like(centres[:1]), *candidates])
+    centers, axes = c2w[:, :3, 3], normalize(c2w[:, :3, 2], dim=1)
+    candidates = [centers + reach * axes for reach in (0.5, 1.0, 2.0, 4.0)]
+    start = torch.cat([torch.zeros_like(centers[:1]), *candidates])
     start = start[:: -(-len(start) // 512)]
-    weights = torch.full_like(centres[:, 0], 1 / len(centres))
+    weights = torch.full_like(centers[:, 0], 1 / len(centers))
     point = start[(axis_cosines(c2w, start) @ weights).argmax()]
     for _ in range(3):
         point = _maximize_mean_cosine(c2w, point, weights)
-        directions = normalize(point - centres, dim=1)
+        directions = normalize(point - centers, dim=1)
         density = torch.exp(DENSITY_CONCENTRATION * (directions @ directions.T - 1)).sum(1)
         weights = (1 / density).clamp_max(MAX_DENSITY_WEIGHT / float(density.median()))
         weights = weights / weights.sum()
@@ -144,11 +144,11 @@ def _maximize_mean_cosine(
     c2w: Float[Tensor, "V 4 4"], point: Float[Tensor, "3"], weights: Float[Tensor, "V"]
 ) -> Float[Tensor, "3"]:
     """Local maximum of the weighted mean cosine, by Levenberg-Marquardt on the chords between directions and axes."""
-    centres, axes = c2w[:, :3, 3].cpu().numpy(), normalize(c2w[:, :3, 2], dim=1).cpu().numpy()
+    centers, axes = c2w[:, :3, 3].cpu().numpy(), normalize(c2w[:, :3, 2], dim=1).cpu().numpy()
     root = weights.sqrt()[:, None].cpu().numpy()
 
     def chords(candidate: Float[np.ndarray, "3"]) -> Float[np.ndarray, "R"]:
-        offset = candidate - centres
+        offset = candidate - centers
         return (root * (offset / np.linalg.norm(offset, axis=1, keepdims=True).clip(1e-12) - axes)).ravel()
 
     start = point.cpu().numpy()

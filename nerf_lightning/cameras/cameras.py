@@ -69,7 +69,7 @@ class Cameras(TensorDataclass):
         return replace(super().map_tensors(operation), sizes=self.sizes)
 
     @property
-    def centres(self) -> Float[Tensor, "V 3"]:
+    def centers(self) -> Float[Tensor, "V 3"]:
         return self.c2w[:, :3, 3]
 
     def size(self, view: int) -> tuple[int, int]:
@@ -95,7 +95,7 @@ class Cameras(TensorDataclass):
         return int(self.sizes.max())
 
     def resize(self, sizes: Int[Tensor, "V 2"] | tuple[int, int]) -> "Cameras":
-        """Resizes the pixel grids and scales K with them (pixel edges, not centres, stay in place)."""
+        """Resizes the pixel grids and scales K with them (pixel edges, not centers, stay in place)."""
         if isinstance(sizes, tuple):
             sizes = torch.tensor([sizes]).repeat(len(self), 1)
         scale = torch.cat([sizes.double() / self.sizes, torch.ones(len(self), 1, dtype=torch.float64)], dim=1)
@@ -126,10 +126,10 @@ class Cameras(TensorDataclass):
 
     def pixel_footprint(self, point: Float[Tensor, "3"]) -> float:
         """Footprint of one pixel at a point, world units: the median over the views."""
-        return float(((self.centres - point).norm(dim=1) / self.K[:, 0, 0]).median())
+        return float(((self.centers - point).norm(dim=1) / self.K[:, 0, 0]).median())
 
     def generate_rays(self, view: Int[Tensor, "R"], row: Int[Tensor, "R"], col: Int[Tensor, "R"]) -> Rays:
-        """Rays through the centres of the given pixels."""
+        """Rays through the centers of the given pixels."""
         u, v = col.to(self.K.dtype) + 0.5, row.to(self.K.dtype) + 0.5
         if self.lenses is None:
             u_axis, v_axis, offset = self.pixel_axes[view].unbind(1)
@@ -141,7 +141,7 @@ class Cameras(TensorDataclass):
             normalized = undistort(pixels_to_normalized(self.K[view], points), coefficients, start, steps=1)
             local = normalized_to_directions(normalized, self.lenses.projection[view])
             directions = (self.c2w[view, :3, :3] * local[:, None]).sum(2)
-        return Rays(self.centres[view], torch.nn.functional.normalize(directions, dim=1))
+        return Rays(self.centers[view], torch.nn.functional.normalize(directions, dim=1))
 
     @cached_property
     def pixel_axes(self) -> Float[Tensor, "V 3 3"]:
@@ -188,10 +188,10 @@ class Cameras(TensorDataclass):
         """Projects world points into a view.
 
         Returns:
-            Pixels (column, row; the first pixel's centre is at 0.5), undefined for invisible points; depth along the
+            Pixels (column, row; the first pixel's center is at 0.5), undefined for invisible points; depth along the
             optical axis, or distance in an equirectangular view, world units; mask of the points inside the photo.
         """
-        local = (points - self.centres[view]).to(self.c2w) @ self.c2w[view, :3, :3]
+        local = (points - self.centers[view]).to(self.c2w) @ self.c2w[view, :3, :3]
         depth = local[:, 2]
         if self.lenses is None:
             is_visible, normalized = depth > 0, local[:, :2] / torch.where(depth > 0, depth, 1.0)[:, None]

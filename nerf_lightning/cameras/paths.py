@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from nerf_lightning.cameras.camera_layout import CameraLayout, centre_spread, find_convergence
+from nerf_lightning.cameras.camera_layout import CameraLayout, center_spread, find_convergence
 from nerf_lightning.cameras.cameras import Cameras
 from nerf_lightning.cameras.poses import estimate_up, find_typical_view, horizontal_axes, look_at, mean_up
 
@@ -28,7 +28,7 @@ MIN_ONE_SIDED_MEAN = 0.1
 """Length of the mean direction from subject to views below which a path surrounds it."""
 
 
-def make_orbit_path(cameras: Cameras, layout: CameraLayout, centre: Float[Tensor, "3"], frames: int = 60) -> Cameras:
+def make_orbit_path(cameras: Cameras, layout: CameraLayout, center: Float[Tensor, "3"], frames: int = 60) -> Cameras:
     """A closed camera path near the training cameras, upright, with the intrinsics of a typical one.
 
     Inward: a full turn around the subject at the cameras' distance and height, or a swing within the arc that they cover.
@@ -38,23 +38,23 @@ def make_orbit_path(cameras: Cameras, layout: CameraLayout, centre: Float[Tensor
     Args:
         cameras: at least one.
         layout: from `classify_layout`.
-        centre: the subject, for inward and forward layouts.
+        center: the subject, for inward and forward layouts.
         frames: number of views; the last stops one step short of the first, so that a loop is smooth.
     """
     c2w = cameras.c2w.double()
     up = estimate_up(c2w)
-    centres = c2w[:, :3, 3]
+    centers = c2w[:, :3, 3]
     if layout == CameraLayout.WALK:
         poses = make_walk_path(c2w, up, frames)
     elif layout == CameraLayout.FORWARD:
-        poses = make_forward_facing_loop(c2w, centre.double(), up, frames)
+        poses = make_forward_facing_loop(c2w, center.double(), up, frames)
     elif layout == CameraLayout.PAN:
-        spot = centres.median(0).values.expand(frames, 3)
+        spot = centers.median(0).values.expand(frames, 3)
         poses = look_at(spot, spot + make_angular_loop(c2w[:, :3, 2], up, frames)[0], up)
     else:
-        direction, weights = make_angular_loop(centres - centre, up, frames)
-        distance = weights @ (centres - centre).norm(dim=1)
-        poses = look_at(centre + distance[:, None] * direction, centre.double(), up)
+        direction, weights = make_angular_loop(centers - center, up, frames)
+        distance = weights @ (centers - center).norm(dim=1)
+        poses = look_at(center + distance[:, None] * direction, center.double(), up)
     lens = cameras[find_typical_view(cameras)].to_pinhole()  # a panorama has no field of view to reuse
     K, (width, height) = lens.K[0], lens.size(0)
     right, down = (lens.c2w[0, :3, axis].double() @ up for axis in (0, 1))
@@ -106,9 +106,9 @@ def make_angular_loop(
 
 
 def make_forward_facing_loop(
-    c2w: Float[Tensor, "V 4 4"], centre: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int
+    c2w: Float[Tensor, "V 4 4"], center: Float[Tensor, "3"], up: Float[Tensor, "3"], frames: int
 ) -> Float[Tensor, "frames 4 4"]:
-    """An ellipse in the image plane of forward-facing cameras, spanning most of their centres."""
+    """An ellipse in the image plane of forward-facing cameras, spanning most of their centers."""
     middle = c2w[:, :3, 3].mean(0)
     offset = c2w[:, :3, 3] - middle
     forward = normalize(c2w[:, :3, 2].mean(0), dim=0)
@@ -117,7 +117,7 @@ def make_forward_facing_loop(
     phase = torch.arange(frames, dtype=up.dtype, device=up.device) * (2 * math.pi / frames)
     ellipse = axes * torch.stack([torch.cos(phase), torch.sin(phase)], dim=1)
     eye = middle + ellipse[:, :1] * right + ellipse[:, 1:] * down
-    return look_at(eye, centre, up)
+    return look_at(eye, center, up)
 
 
 def make_walk_path(c2w: Float[Tensor, "V 4 4"], up: Float[Tensor, "3"], frames: int) -> Float[Tensor, "frames 4 4"]:
@@ -167,7 +167,7 @@ def find_pivot(path: Cameras) -> Float[Tensor, "3"]:
     c2w = path.c2w
     if (target := find_convergence(c2w)) is not None:
         return target.to(c2w)
-    return c2w[0, :3, 3] + (centre_spread(c2w) or 1.0) * c2w[0, :3, 2]
+    return c2w[0, :3, 3] + (center_spread(c2w) or 1.0) * c2w[0, :3, 2]
 
 
 def make_spiral_path(orbit: Cameras, frames: int = 60) -> Cameras:
@@ -186,11 +186,11 @@ def make_spiral_path(orbit: Cameras, frames: int = 60) -> Cameras:
     index = torch.arange(frames)
     loop = resample_path(orbit, frames, closed=True)[SPIRAL_TURNS * index % frames]
     up = mean_up(orbit)
-    centre = target.to(up)
-    distance, direction = (loop.centres - centre).norm(dim=1, keepdim=True), normalize(loop.centres - centre, dim=1)
+    center = target.to(up)
+    distance, direction = (loop.centers - center).norm(dim=1, keepdim=True), normalize(loop.centers - center, dim=1)
     mean_direction = direction.mean(0)
     axis = normalize(mean_direction, dim=0) if float(mean_direction.norm()) > MIN_ONE_SIDED_MEAN else up
     ratio = 1 - SPIRAL_CLIMB_FRACTION * (1 - torch.cos(index.to(up) * (2 * math.pi / frames)))[:, None] / 2
     blended = (1 - ratio) * axis + ratio * direction
-    eye = centre + normalize(blended, dim=1) * (ratio * distance + (1 - ratio) * distance.mean())
-    return replace(loop, c2w=look_at(eye, centre, up))
+    eye = center + normalize(blended, dim=1) * (ratio * distance + (1 - ratio) * distance.mean())
+    return replace(loop, c2w=look_at(eye, center, up))

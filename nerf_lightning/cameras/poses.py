@@ -37,21 +37,21 @@ def look_at(
 
 
 def make_circle_poses(
-    centre: Float[Tensor, "3"], up: Float[Tensor, "3"], radius: float, elevation: float, frames: int
+    center: Float[Tensor, "3"], up: Float[Tensor, "3"], radius: float, elevation: float, frames: int
 ) -> Float[Tensor, "frames 4 4"]:
-    """A full circle of poses around `centre`, all looking at it.
+    """A full circle of poses around `center`, all looking at it.
 
     Args:
-        centre: the subject, world frame.
+        center: the subject, world frame.
         up: unit vector, the circle's axis.
         radius: distance to the subject, scene's unit.
-        elevation: angle above the plane through `centre` orthogonal to `up`, radians.
+        elevation: angle above the plane through `center` orthogonal to `up`, radians.
         frames: number of poses; the last stops one step short of the first, so that a loop is smooth.
     """
     a, b = horizontal_axes(up)
     angle = torch.arange(frames, dtype=up.dtype, device=up.device)[:, None] * (2 * math.pi / frames)
     ring = math.cos(elevation) * (torch.cos(angle) * a + torch.sin(angle) * b) + math.sin(elevation) * up
-    return look_at(centre + radius * ring, centre, up)
+    return look_at(center + radius * ring, center, up)
 
 
 def horizontal_axes(up: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:

@@ -1,4 +1,4 @@
-"""Pinhole geometry and rigid transforms. OpenCV frame: x right, y down, z forward; pixel centres at +0.5."""
+"""Pinhole geometry and rigid transforms. OpenCV frame: x right, y down, z forward; pixel centers at +0.5."""
 
 import torch
 from jaxtyping import Float
@@ -33,7 +33,7 @@ def pixel_to_camera(
 
     Args:
         K: intrinsics [[fx, s, cx], [0, fy, cy], [0, 0, 1]] in pixels.
-        uv: continuous pixel coordinates (x right, y down); the centre of pixel (row, col) is (col + 0.5, row + 0.5).
+        uv: continuous pixel coordinates (x right, y down); the center of pixel (row, col) is (col + 0.5, row + 0.5).
         depth: distance along the camera's z axis, in the scene's unit.
     """
     normalized = pixels_to_normalized(K, uv)

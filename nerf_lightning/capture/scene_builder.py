@@ -32,7 +32,7 @@ def undistort_photos(
     The pinhole camera zooms in just enough that every pixel has a source.
     """
     size, distortion = (lens.width, lens.height), lens.opencv_distortion
-    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV puts pixel centres at integers, we put them at +0.5
+    half = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV puts pixel centers at integers, we put them at +0.5
     pinhole = lens.K - half
     if distortion.any():
         pinhole, _ = cv2.getOptimalNewCameraMatrix(pinhole, distortion, size, 0, size)
@@ -57,12 +57,12 @@ def build_scene(
 ) -> Scene:
     """Builds an unbounded scene from registered photos.
 
-    The scene's frame is that of the tags: metres, z out of the paper. The box is a cube around the point that the cameras
+    The scene's frame is that of the tags: meters, z out of the paper. The box is a cube around the point that the cameras
     look at, half as wide as the photos show there.
 
     Args:
         paths: the photos, all of the lens's size.
-        c2w: camera to world, OpenCV frame, metres.
+        c2w: camera to world, OpenCV frame, meters.
         lens: intrinsics of the photos.
         name, source: see `Scene`.
         max_side: side of the scene's photos in pixels; None keeps their size.
@@ -83,14 +83,14 @@ def build_scene(
         is_val[len(paths) // 2] = True
     train = Views.from_images(images[~is_val], cameras[~is_val])
     region = find_region(train.cameras.c2w)
-    centre = region.centre.float()
-    nearest = float((train.cameras.centres - centre).norm(dim=1).min())
-    aabb = centre + SUBJECT_WIDTH_FRACTION * (torch.from_numpy(estimate_visible_cube(train.cameras)).float() - centre)
+    center = region.center.float()
+    nearest = float((train.cameras.centers - center).norm(dim=1).min())
+    aabb = center + SUBJECT_WIDTH_FRACTION * (torch.from_numpy(estimate_visible_cube(train.cameras)).float() - center)
     return Scene(
         name=name,
         source=source,
         train=train,
         val=Views.from_images(images[is_val], cameras[is_val]),
-        orbit=make_orbit_path(train.cameras, region.layout, centre),
+        orbit=make_orbit_path(train.cameras, region.layout, center),
         bounds=Bounds(aabb, unbounded=True, near=NEAR_FRACTION * min(region.unit, nearest)),
     )

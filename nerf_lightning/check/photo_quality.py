@@ -32,7 +32,7 @@ class PhotoQuality:
     split: str
     """"train" or "held out"."""
     preview: UInt8[np.ndarray, "h w 3"]
-    """Downsampled, transparent parts in grey."""
+    """Downsampled, transparent parts in gray."""
     sharpness: float
     brightness: float
     """Mean, in [0, 1]."""
@@ -70,8 +70,8 @@ def sharpness(image: UInt8[np.ndarray, "H W 3"]) -> float:
 
     The ratio cancels content and exposure; the slight blur suppresses noise.
     """
-    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
-    fine, coarse = (cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), sigma), cv2.CV_32F) for sigma in (0.7, 2.0))
+    gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    fine, coarse = (cv2.Laplacian(cv2.GaussianBlur(gray, (0, 0), sigma), cv2.CV_32F) for sigma in (0.7, 2.0))
     return float(fine.std() / max(float(coarse.std()), 1e-3))
 
 

@@ -11,7 +11,7 @@ from nerf_lightning.utils.files import check_output_path, expand_user_path
 from nerf_lightning.utils.option_checks import Ge, Le
 
 TagSize = Annotated[float, Ge(1e-4), Le(1)]
-"""Metres, above the size of a printer's dots; larger numbers are probably in another unit."""
+"""Meters, above the size of a printer's dots; larger numbers are probably in another unit."""
 BoardSquares = Annotated[int, Ge(3), Le(1000)]
 """Squares along a side of a ChArUco board."""
 
@@ -38,13 +38,13 @@ def capture(
     Args:
         calibration: Folder of photos of only the tags, from many angles.
         photos: Folder of photos of the subject with tags in view, in the order taken, with the same zoom.
-        tag_size: Side of a tag's black square, metres.
+        tag_size: Side of a tag's black square, meters.
         output: Scene to write, FILE.npz; cameras.json, calibration.yaml and FILE_report/ go to its folder.
         dictionary: OpenCV's name of the tags' family, such as DICT_4X4_50; auto tries the common ones.
         layout: sheet_2x3, or a YAML file of tag positions; default: estimated from the photos.
         board_columns: Squares of a ChArUco board from left to right, if used instead of tags.
         board_rows: Squares of the board from top to bottom.
-        board_square: Side of a square of the board, metres.
+        board_square: Side of a square of the board, meters.
         resize: Longest side of the scene's photos, pixels; 0 keeps their size.
         holdout: Every N-th photo is held out for validation.
 
@@ -87,7 +87,7 @@ def print_tags(
 
     Args:
         sheet: FILE.pdf to write.
-        tag_size: Side of a tag's black square, metres.
+        tag_size: Side of a tag's black square, meters.
         dictionary: OpenCV's name of the tags' family.
         layout: sheet_2x3 (six tags), or a YAML file of tag positions.
 

@@ -34,7 +34,7 @@ def command(function: Callable[P, T]) -> Callable[P, T]:
     parameters = signature.parameters
 
     @functools.wraps(function)
-    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+    def call_checked(*args: P.args, **kwargs: P.kwargs) -> T:
         bound = signature.bind(*args, **kwargs)
         for key, value in bound.arguments.items():
             if Path not in get_args(hints[key]) + (hints[key],):
@@ -47,4 +47,4 @@ def command(function: Callable[P, T]) -> Callable[P, T]:
         check_options("", function, named, source=function.__name__.replace("_", "-"))
         return function(*bound.args, **bound.kwargs)
 
-    return checked
+    return call_checked

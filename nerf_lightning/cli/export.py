@@ -39,10 +39,10 @@ def export_mesh(
     photos: Photos = None,
     device: Device = "auto",
 ) -> Path:
-    """Write a coloured surface mesh, in the coordinates of the photos' own file.
+    """Write a colored surface mesh, in the coordinates of the photos' own file.
 
     Args:
-        output: FILE.ply, .glb (3D viewers), .obj (modellers) or .stl (printers; no colours); default: mesh.ply in the run.
+        output: FILE.ply, .glb (3D viewers), .obj (modelers) or .stl (printers; no colors); default: mesh.ply in the run.
     """
     return _write_geometry("mesh", run, output, device, resolution, box, threshold, photos)
 
@@ -60,7 +60,7 @@ def export_points(
     photos: Photos = None,
     device: Device = "auto",
 ) -> Path:
-    """Write a coloured point cloud of the surface, in the coordinates of the photos' own file.
+    """Write a colored point cloud of the surface, in the coordinates of the photos' own file.
 
     Args:
         output: FILE.ply; default: points.ply in the run.
@@ -79,7 +79,7 @@ def export_voxels(
     output: Output = None,
     device: Device = "auto",
 ) -> Path:
-    """Write a voxel grid of density and colour, with its transform.
+    """Write a voxel grid of density and color, with its transform.
 
     Args:
         output: FILE.npz; default: voxels.npz in the run.

@@ -25,7 +25,7 @@ def rightsize(
 ) -> dict[str, Any]:
     """Find the smallest model that is good enough, and train it.
 
-    One training grows along a ladder of sizes while the gain justifies the bytes. The candidate size and a neighbour are then
+    One training grows along a ladder of sizes while the gain justifies the bytes. The candidate size and a neighbor are then
     trained in full. Writes runs (rung_N), compact.npz, chart.png, rightsize.json, and best.yaml for
     train +experiment=best.yaml. If interrupted, the same command continues.
 
@@ -53,7 +53,7 @@ def rightsize(
     from nerf_lightning.runs.run_lock import lock_folder
     from nerf_lightning.sizing.choose import Target, read_ladder
     from nerf_lightning.sizing.report import REPORT_FILE, explain_choice, write_report
-    from nerf_lightning.sizing.search import search_sizes, start_or_resume
+    from nerf_lightning.sizing.search import search_sizes, write_or_check_plan
     from nerf_lightning.utils.files import check_output_path
     from nerf_lightning.utils.parsing import read_json
 
@@ -66,7 +66,7 @@ def rightsize(
     target = Target(psnr, 0.3 if within_db is None else within_db)
     with lock_folder(folder):
         if (folder / REPORT_FILE).is_file():
-            start_or_resume(folder, cfg, target, sizes)
+            write_or_check_plan(folder, cfg, target, sizes)
             result = read_json(folder / REPORT_FILE, "a finished search")
         else:
             result = search_sizes(cfg, target, sizes, folder)

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 
 from nerf_lightning.comparison.points import COSTS, find_median_run, format_bytes
 from nerf_lightning.drawing.style import (
-    GREY,
+    GRAY,
     VERMILLION,
     assign_styles,
     rasterize_figure,
@@ -23,7 +23,7 @@ from nerf_lightning.drawing.style import (
 PANEL_WIDTH_IN, PANEL_HEIGHT_IN, DPI = 4.8, 3.5, 172
 """Panel size in inches, and pixels per inch."""
 MAX_LABELS = 8
-"""Up to this many points, each has a label and colour; beyond, only the frontier is labelled and colours mark methods."""
+"""Up to this many points, each has a label and color; beyond, only the frontier is labeled and colors mark methods."""
 MAX_ROWS = 12
 """Configurations in the quality panel."""
 MAX_PUBLISHED_TIME_RATIO = 30.0
@@ -92,10 +92,10 @@ def draw_cost(points: pd.DataFrame, cost: str, references: pd.DataFrame) -> Figu
     for one in references.itertuples() if training else ():
         x, inside = min(one.seconds, reach), one.seconds <= reach
         xs.append(x)
-        axes.scatter([x], [one.psnr], 34, "none", marker="o" if inside else ">", edgecolor=GREY, label=label)
+        axes.scatter([x], [one.psnr], 34, "none", marker="o" if inside else ">", edgecolor=GRAY, label=label)
         time = f"{one.seconds / 3600:.1f} h" if one.seconds >= 3600 else f"{one.seconds / 60:.0f} min"
         name = one.name if inside else f"{one.name} ({time})"
-        texts.append(add_label(axes, name, x, one.psnr, GREY))
+        texts.append(add_label(axes, name, x, one.psnr, GRAY))
         label = ""
     if training and len(points) <= MAX_LABELS:
         low, high = axes.get_ylim()

@@ -17,7 +17,7 @@ ROUNDTRIP_GRID, MAX_ROUNDTRIP_ERROR_PX = 24, 1.0
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """Intrinsics in pixels, pixel centres at +0.5, the distortion and the projection (see `cameras.Lenses`)."""
+    """Intrinsics in pixels, pixel centers at +0.5, the distortion and the projection (see `cameras.Lenses`)."""
 
     width: int
     height: int
@@ -67,7 +67,7 @@ def is_invertible(intrinsics: Intrinsics) -> bool:
 
 
 def make_equirectangular(width: int, height: int) -> Intrinsics:
-    """Intrinsics of an equirectangular panorama, 360 x 180 degrees, centred on the optical axis."""
+    """Intrinsics of an equirectangular panorama, 360 x 180 degrees, centered on the optical axis."""
     return Intrinsics(
         width,
         height,

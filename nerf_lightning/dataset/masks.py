@@ -24,7 +24,7 @@ MAX_NAMED = 4
 CELLS_PER_SIDE = 16
 """Side of the coarse grid in which masks are averaged to detect inverted ones."""
 MAX_COLOR_SPREAD = 12
-"""Deviation from the median, in 1/255, within which JPEG pixels count as one colour."""
+"""Deviation from the median, in 1/255, within which JPEG pixels count as one color."""
 
 
 def find_masks(photos: Sequence[Path], root: Path) -> list[Path | None]:
@@ -107,15 +107,15 @@ def read_mask(path: Path, width: int, height: int, invert: bool) -> UInt8[np.nda
         InputError: not an image.
     """
     pixels = read_pixels(path)
-    grey = pixels[..., 3] if pixels.shape[2] == 4 else pixels.max(axis=2)
-    mask = np.where(grey >= MASK_THRESHOLD, 255, 0).astype(np.uint8)
+    gray = pixels[..., 3] if pixels.shape[2] == 4 else pixels.max(axis=2)
+    mask = np.where(gray >= MASK_THRESHOLD, 255, 0).astype(np.uint8)
     mask = 255 - mask if invert else mask
     interpolation = cv2.INTER_AREA if mask.shape[1] >= width and mask.shape[0] >= height else cv2.INTER_NEAREST
     return np.asarray(cv2.resize(mask, (width, height), interpolation=interpolation), np.uint8)
 
 
 def is_cut_out_by_mask(image: UInt8[np.ndarray, "H W C"], mask: Bool[np.ndarray, "H W"]) -> bool:
-    """True if the masked region covers most of the border in one colour, that is, the subject was cut out."""
+    """True if the masked region covers most of the border in one color, that is, the subject was cut out."""
     if extract_border(mask).mean() > 0.5:
         return False
     masked = image[..., :3][~mask]

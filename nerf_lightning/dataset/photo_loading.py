@@ -43,7 +43,7 @@ class PhotoLoadOptions:
             keeps the size.
         holdout: hold out every N-th photo, sorted by name, if the format defines no split.
         masked: meaning of masked or transparent pixels: "ignore" (unknown: not sampled, not scored) or "background" (the
-            subject is cut out); "auto" takes alpha, and masks whose masked region has one colour, as background.
+            subject is cut out); "auto" takes alpha, and masks whose masked region has one color, as background.
         invert_masks: masks are black where the photo is kept.
         bounded: "true", "false", or "auto" to classify the photos, see `classify_scene`.
         orientation: "stored", "exif" or "auto", see `choose_orientations`.

@@ -16,7 +16,7 @@ SUN_POSITION = (0.66, 0.30)
 
 
 def load_picture(path: Path) -> UInt8[Tensor, "H W 3"]:
-    """Reads an image as 8-bit sRGB: EXIF rotation applied, 16 bits reduced, grey to RGB, alpha over white.
+    """Reads an image as 8-bit sRGB: EXIF rotation applied, 16 bits reduced, gray to RGB, alpha over white.
 
     Raises:
         InputError: missing, truncated, not an image, or floating-point pixels.

@@ -1,4 +1,4 @@
-"""PixelDataModule: pixel coordinates of a picture and their colours."""
+"""PixelDataModule: pixel coordinates of a picture and their colors."""
 
 import hashlib
 from collections.abc import Callable
@@ -62,10 +62,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class PixelBatch(TensorDataclass):
-    """N pixel coordinates and their colours."""
+    """N pixel coordinates and their colors."""
 
     uv: Float[Tensor, "N 2"]
-    """In [0, 1]^2, x right, y down; the centre of pixel (row, col) is ((col + 0.5) / W, (row + 0.5) / H)."""
+    """In [0, 1]^2, x right, y down; the center of pixel (row, col) is ((col + 0.5) / W, (row + 0.5) / H)."""
     rgb: Float[Tensor, "N 3"]
 
 
@@ -82,7 +82,7 @@ class PictureBatch(PixelBatch):
 
 
 def pixel_grid(height: int, width: int, subset: PixelSubset = ALL_PIXELS) -> Float[Tensor, "N 2"]:
-    """Pixel centres, row-major, see `PixelBatch.uv`."""
+    """Pixel centers, row-major, see `PixelBatch.uv`."""
     rows, columns = subset.grid(width, height)
     x, y = (columns + 0.5) / width, (rows + 0.5) / height
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).view(-1, 2)

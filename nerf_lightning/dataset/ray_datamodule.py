@@ -25,9 +25,9 @@ ErrorSampling = Annotated[float, Ge(0), Le(0.99)]
 DEFAULT_ERROR_SAMPLING = 0.5
 """Fraction of the rays sampled by error."""
 BASELINE_PIXELS = 8192
-"""Pixels on which the constant-colour baseline is measured."""
+"""Pixels on which the constant-color baseline is measured."""
 TEXTURE_RADIUS = 0.0125
-"""Distance of the neighbours in `measure_texturelessness`, relative to the photo's longest side."""
+"""Distance of the neighbors in `measure_texturelessness`, relative to the photo's longest side."""
 TEXTURE_CONTRAST = 0.01
 """Contrast at which texturelessness is 1/e: two or three 8-bit levels, about the noise."""
 
@@ -77,7 +77,7 @@ def make_view_batch(views: Views, view: int, subset: PixelSubset = ALL_PIXELS) -
 
 
 def measure_texturelessness(views: Views, pixels: Int[Tensor, "R"], view: Int[Tensor, "R"]) -> Float[Tensor, "R"]:
-    """Texturelessness in [0, 1] around each pixel: 1 if its four neighbours have the same colour, else exp(-contrast).
+    """Texturelessness in [0, 1] around each pixel: 1 if its four neighbors have the same color, else exp(-contrast).
 
     Photos barely constrain the depth of textureless surfaces.
     """
@@ -189,7 +189,7 @@ class RayDataModule(StepDataModule[Views]):
         return make_batch(photos, pixels[part], self._with_texture, weights[part])
 
     def make_baseline_batch(self) -> RayBatch:
-        """Samples training pixels for the constant-colour baseline."""
+        """Samples training pixels for the constant-color baseline."""
         generator = step_generator(self.seed, Stream.BASELINE, 0)
         return make_batch(self.scene.train, self.scene.train.sample_pixels(BASELINE_PIXELS, generator))
 

@@ -124,7 +124,7 @@ def fit_size(width: int, height: int, longest: int | None) -> tuple[int, int]:
 
 
 def resize_area(image: UInt8[np.ndarray, "H W C"], width: int, height: int) -> UInt8[np.ndarray, "h w C"]:
-    """Area-averages an image; RGBA with premultiplied alpha, since arbitrary colours under alpha 0 would give dark rims."""
+    """Area-averages an image; RGBA with premultiplied alpha, since arbitrary colors under alpha 0 would give dark rims."""
     if image.shape[:2] == (height, width):
         return image
     if image.shape[2] == 3:

@@ -32,7 +32,7 @@ class Scene:
     """sRGB background: baked into images without alpha, the convention for images with alpha."""
     to_source: Float[Tensor, "4 4"] = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))
     """Similarity from this scene's frame to the file's, so that exports keep the original position and scale. float64:
-    georeferenced coordinates are millions of metres."""
+    georeferenced coordinates are millions of meters."""
     test: Views | None = None
     """Held-out views evaluated only at the end, if the format has both splits."""
     kind: str = ""

@@ -29,10 +29,10 @@ class VoxelProjection(NamedTuple):
     """Projection of a grid of N voxels into one view."""
 
     inside: Bool[np.ndarray, "N"]
-    """Whether each centre is in the picture."""
+    """Whether each center is in the picture."""
     row: Int[np.ndarray, "N"]
     column: Int[np.ndarray, "N"]
-    """Pixel of each voxel's centre; 0 outside the picture."""
+    """Pixel of each voxel's center; 0 outside the picture."""
     footprint: UInt8[np.ndarray, "F F"]
     """Dilation kernel that covers half a voxel's diagonal: any part of a voxel may be content."""
 
@@ -57,7 +57,7 @@ def estimate_bounds(
             masks, project_voxels(aabb, HULL_RESOLUTION, views.cameras), min_views=0.5 * len(masks)
         )
         if hull.any():
-            kept, voxel = list_voxel_centres(aabb, HULL_RESOLUTION)[hull], (aabb[1] - aabb[0]) / HULL_RESOLUTION
+            kept, voxel = list_voxel_centers(aabb, HULL_RESOLUTION)[hull], (aabb[1] - aabb[0]) / HULL_RESOLUTION
             aabb = np.stack([kept.min(0) - 1.5 * voxel, kept.max(0) + 1.5 * voxel])
     return Bounds(torch.from_numpy(aabb).float(), unbounded=False, near=near, far=far)
 
@@ -104,19 +104,19 @@ def estimate_visible_cube(cameras: Cameras) -> Float[np.ndarray, "2 3"]:
     """Estimates a cube around the region of interest, as wide as the field of view there, in world units."""
     region = find_region(cameras.c2w)
     tangent = float((cameras.sizes / cameras.K[:, [0, 1], [0, 1]].cpu()).max()) / 2
-    centre, half = region.centre.cpu().numpy(), region.unit * tangent
-    return np.stack([centre - half, centre + half])
+    center, half = region.center.cpu().numpy(), region.unit * tangent
+    return np.stack([center - half, center + half])
 
 
-def list_voxel_centres(aabb: Float[np.ndarray, "2 3"], count: int) -> Float[np.ndarray, "N 3"]:
-    """Lists the centres of count^3 voxels in a box."""
+def list_voxel_centers(aabb: Float[np.ndarray, "2 3"], count: int) -> Float[np.ndarray, "N 3"]:
+    """Lists the centers of count^3 voxels in a box."""
     steps = aabb[0][:, None] + (np.arange(count) + 0.5) * ((aabb[1] - aabb[0]) / count)[:, None]
     return np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def project_voxels(aabb: Float[np.ndarray, "2 3"], count: int, cameras: Cameras) -> Iterator[VoxelProjection]:
     """Projects a box of count^3 voxels into each camera."""
-    points = torch.from_numpy(list_voxel_centres(aabb, count)).float()
+    points = torch.from_numpy(list_voxel_centers(aabb, count)).float()
     diagonal = np.linalg.norm((aabb[1] - aabb[0]) / count)
     for view in range(len(cameras)):
         pixels, depth, visible = cameras.project(points, view)

@@ -68,7 +68,7 @@ class Hints:
     points: Float[np.ndarray, "P 3"] | None = None
     """Surface points, in the file's frame."""
     background: tuple[float, float, float] | None = None
-    """Background colour."""
+    """Background color."""
     bounds: Bounds | None = None
     """Box in the file's frame, which the scene then keeps."""
     near: float | None = None
@@ -162,9 +162,9 @@ def assemble_scene(
         return replace(cameras, c2w=transform_poses(cameras.c2w, from_source).float())
 
     splits = [replace(apply_alpha(part, kind.is_cutout), cameras=move(part.cameras)) for part in parts]
-    centre = transform_points(from_source, region.centre.double()).float()
+    center = transform_points(from_source, region.center.double()).float()
     orbit = (
-        make_orbit_path(splits[0].cameras, region.layout, centre)
+        make_orbit_path(splits[0].cameras, region.layout, center)
         if hints.camera_path is None
         else move(hints.camera_path)
     )
@@ -198,7 +198,7 @@ def locate_region(source: Path, views: Views, hints: Hints) -> Region:
 
 def is_float32_precise(cameras: Cameras, region: Region) -> bool:
     """Whether float32 resolves pixels in the file's frame, unlike in georeferenced ones with a distant origin."""
-    return checks.FLOAT32_EPS * float(cameras.centres.abs().max()) <= region.unit / float(cameras.K[:, 0, 0].median())
+    return checks.FLOAT32_EPS * float(cameras.centers.abs().max()) <= region.unit / float(cameras.K[:, 0, 0].median())
 
 
 def find_bounds(
@@ -217,7 +217,7 @@ def find_bounds(
         points = transform_points(from_source, torch.from_numpy(hints.points)).float()
         nears.append(CONTENT_NEAR_FRACTION * find_nearest_distance(points, views))
     if region.has_subject:
-        nears.append(NEAR_FRACTION * min(1.0, float(views.cameras.centres.norm(dim=1).min())))
+        nears.append(NEAR_FRACTION * min(1.0, float(views.cameras.centers.norm(dim=1).min())))
     near = min(nears, default=None) if near is None else near
     return Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]), unbounded=True, near=near, far=far)
 
@@ -235,15 +235,15 @@ def find_nearest_distance(points: Float[Tensor, "P 3"], views: Views) -> float:
     points = points[:: -(-len(points) // MAX_NEAR_POINTS)]
     nearest = [math.inf]
     for view in range(len(views)):
-        distance = (points - views.cameras.centres[view]).norm(dim=1)[views.cameras.project(points, view)[2]]
+        distance = (points - views.cameras.centers[view]).norm(dim=1)[views.cameras.project(points, view)[2]]
         if len(distance):
             nearest.append(float(distance.quantile(OUTLIER_QUANTILE)))
     return min(nearest)
 
 
 def make_region_frame(c2w: Float[Tensor, "V 4 4"], region: Region) -> Float[Tensor, "4 4"]:
-    """Similarity to the photos' frame from one centred on the region, in its unit, with z up."""
+    """Similarity to the photos' frame from one centered on the region, in its unit, with z up."""
     to_source = torch.eye(4, dtype=torch.float64)
     to_source[:3, :3] = region.unit * rotation_to_z_up(estimate_up(c2w)).mT
-    to_source[:3, 3] = region.centre
+    to_source[:3, 3] = region.center
     return to_source

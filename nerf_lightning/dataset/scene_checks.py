@@ -39,9 +39,9 @@ MAX_CONTENT_FRACTION = 0.9
 MIN_BOX_COVERAGE = 0.9
 """Coverage inside the box below which content lies outside it, if the hull without the box fits well."""
 MAX_ASYMMETRY, MAX_BOX_OFFSET = 0.35, 0.5
-"""Norm of the mean direction up to which cameras surround the centre; largest box offset relative to their distance."""
+"""Norm of the mean direction up to which cameras surround the center; largest box offset relative to their distance."""
 MAX_DISTANCE_RATIO = 8.0
-"""Largest distance of cameras from the box's centre, in its half-sizes, in an unbounded scene."""
+"""Largest distance of cameras from the box's center, in its half-sizes, in an unbounded scene."""
 BACKWARD = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0]))
 """Rotates a camera backward."""
 MAX_CLIPPED_FRACTION = 0.02
@@ -92,12 +92,12 @@ def check_cameras(scene: Scene) -> Iterator[SceneIssue]:
 
 
 def check_background(scene: Scene) -> Iterator[SceneIssue]:
-    """Checks for a uniform border colour that differs from the stated background."""
+    """Checks for a uniform border color that differs from the stated background."""
     if scene.bounds.unbounded or (border := find_border_color(scene.train)) is None:
         return
     if max(abs(a - b) for a, b in zip(border, scene.background, strict=True)) > BACKGROUND_TOLERANCE:
         actual, stated = ([round(channel, 2) for channel in color] for color in (border, scene.background))
-        yield SceneIssue(f"border colour {actual} differs from the stated background {stated}", is_fatal=True)
+        yield SceneIssue(f"border color {actual} differs from the stated background {stated}", is_fatal=True)
 
 
 def check_silhouettes(scene: Scene) -> Iterator[SceneIssue]:
@@ -152,16 +152,16 @@ def check_bounds(scene: Scene) -> Iterator[SceneIssue]:
     if not bounds.unbounded and (bounds.near, bounds.far) != (None, None):
         yield from check_clipping(scene)
     region = find_region(cameras.c2w)
-    offset, size = float((region.centre - bounds.centre)[:2].norm()), bounds.max_half_size
-    directions = torch.nn.functional.normalize(cameras.centres - region.centre.float(), dim=1)
+    offset, size = float((region.center - bounds.center)[:2].norm()), bounds.max_half_size
+    directions = torch.nn.functional.normalize(cameras.centers - region.center.float(), dim=1)
     is_surrounded = region.layout == CameraLayout.INWARD and float(directions[:, :2].mean(0).norm()) < MAX_ASYMMETRY
     if is_surrounded and offset > MAX_BOX_OFFSET * region.unit:
         yield SceneIssue(
-            f"cameras look at a point {offset:.2g} from the box centre, at a distance of {region.unit:.2g}: the box"
+            f"cameras look at a point {offset:.2g} from the box center, at a distance of {region.unit:.2g}: the box"
             " misses their subject"
         )
-    elif bounds.unbounded and float((cameras.centres - bounds.centre).norm(dim=1).median()) > MAX_DISTANCE_RATIO * size:
-        yield SceneIssue(f"cameras more than {MAX_DISTANCE_RATIO:g} half-sizes ({size:.2g}) from the centre of the box")
+    elif bounds.unbounded and float((cameras.centers - bounds.center).norm(dim=1).median()) > MAX_DISTANCE_RATIO * size:
+        yield SceneIssue(f"cameras more than {MAX_DISTANCE_RATIO:g} half-sizes ({size:.2g}) from the center of the box")
 
 
 def check_clipping(scene: Scene) -> Iterator[SceneIssue]:

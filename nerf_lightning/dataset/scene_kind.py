@@ -27,7 +27,7 @@ class SceneKind:
     bounded: bool
     """Whether a box around the subject contains everything visible."""
     background: tuple[float, float, float]
-    """Colour behind the subject, sRGB in [0, 1]."""
+    """Color behind the subject, sRGB in [0, 1]."""
     reason: str
     """Short explanation for the log and results.json."""
     is_cutout: bool = False
@@ -38,7 +38,7 @@ def classify_scene(views: Views, bounded: str, masked: str, alpha_background: tu
     """Classifies the scene of photos of any format.
 
     A scene is bounded if alpha removes most of the photos' borders, or if the borders of photos without alpha have one
-    colour. Everything else is unbounded, and its alpha is a mask.
+    color. Everything else is unbounded, and its alpha is a mask.
 
     Args:
         views: training photos.
@@ -51,7 +51,7 @@ def classify_scene(views: Views, bounded: str, masked: str, alpha_background: tu
         kind = SceneKind(True, alpha_background, "alpha cuts the subject out", is_cutout)
     elif (color := find_border_color(views)) is not None:
         rgb = ", ".join(f"{channel:.2f}" for channel in color)
-        kind = SceneKind(True, color, f"the photos' borders have one colour ({rgb})")
+        kind = SceneKind(True, color, f"the photos' borders have one color ({rgb})")
     else:
         kind = SceneKind(False, (0.0, 0.0, 0.0), "the photos show a background up to their borders")
     if bounded != "auto" and kind.bounded != (bounded == "true"):

@@ -8,13 +8,13 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.drawing.style import BLUE, DPI, GREY, ORANGE, VERMILLION
+from nerf_lightning.drawing.style import BLUE, DPI, GRAY, ORANGE, VERMILLION
 
 FRUSTUM_FRACTION = 0.06
 """Height of a camera's frustum relative to the map's width."""
 FRUSTUM_STROKE = [0, 1, 2, 0, 3, 2, 3, 4, 0, 4, 1]
 """Corners of a frustum in an order that draws all of its edges."""
-CENTRED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "annotation_clip": True}
+CENTERED_TEXT: dict[str, Any] = {"ha": "center", "va": "center", "annotation_clip": True}
 MAX_NUMBERED = 120
 """Most cameras with numbers; of more, every N-th."""
 MAX_POINTS = 5000
@@ -22,7 +22,7 @@ MAX_WIDTH_INCHES, MAX_HEIGHT_INCHES = 13.0, 17.0
 
 
 def frustum_corners(K: Float[np.ndarray, "3 3"], width: int, height: int, depth: float) -> Float[np.ndarray, "5 3"]:
-    """Camera centre and image corners at a depth, in the camera frame."""
+    """Camera center and image corners at a depth, in the camera frame."""
     corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]], dtype=np.float64)
     return depth * np.concatenate([np.zeros((1, 3)), np.linalg.solve(K, corners.T).T])
 
@@ -42,7 +42,7 @@ def plot_camera_map(
         unit: unit of length, for the axes.
     """
     camera = scene.train.cameras[0].to_pinhole()
-    orbit, box = scene.orbit.centres.double().numpy(), scene.bounds.aabb.double().numpy()
+    orbit, box = scene.orbit.centers.double().numpy(), scene.bounds.aabb.double().numpy()
     positions = np.concatenate([np.stack([c2w[:3, 3] for _, c2w in numbered]), orbit, box, *tags.values()])
     depth = FRUSTUM_FRACTION * float(np.ptp(positions[:, :2], axis=0).max())
     shape = frustum_corners(camera.K[0].double().numpy(), *camera.size(0), depth)
@@ -66,7 +66,7 @@ def plot_camera_map(
             label = "" if tag != next(iter(tags)) else "tags, with their ids"
             axes.fill(corners[:, 0], corners[:, up], facecolor="0.8", edgecolor="black", label=label)
         x, y = box[[0, 1, 1, 0, 0], 0], box[[0, 0, 1, 1, 0], up]
-        axes.plot(x, y, "--", color=GREY, linewidth=1.5, label="box of the scene")
+        axes.plot(x, y, "--", color=GRAY, linewidth=1.5, label="box of the scene")
         closed = np.concatenate([orbit, orbit[:1]])
         axes.plot(closed[:, 0], closed[:, up], color=ORANGE, linewidth=2, label="orbit")
         if scene.points is not None:
@@ -74,9 +74,9 @@ def plot_camera_map(
             axes.plot(subset[:, 0], subset[:, up], ".", color="0.6", markersize=1.5, zorder=0.5, label="known points")
         for (number, _), points in list(zip(numbered, frusta, strict=True))[:: -(-len(frusta) // MAX_NUMBERED)]:
             label_position = points[0] - 0.35 * (points[1:].mean(0) - points[0])  # behind the camera
-            axes.annotate(str(number), label_position[[0, up]], fontsize=8, **CENTRED_TEXT)
+            axes.annotate(str(number), label_position[[0, up]], fontsize=8, **CENTERED_TEXT)
     side.set_xlabel(f"x, {unit}")
     for tag, corners in tags.items():
-        above.annotate(str(tag), corners[:, :2].mean(0), fontsize=9, color=VERMILLION, **CENTRED_TEXT)
+        above.annotate(str(tag), corners[:, :2].mean(0), fontsize=9, color=VERMILLION, **CENTERED_TEXT)
     figure.legend(*above.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
     return figure

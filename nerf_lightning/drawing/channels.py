@@ -29,7 +29,7 @@ class FrameStyle:
 
     channels: tuple[str, ...]
     background: tuple[float, float, float] | None
-    """Colour in [0, 1]; None for a transparent background."""
+    """Color in [0, 1]; None for a transparent background."""
     depth_range: tuple[float, float]
     """Bright and dark end of the depth colormap, scene's unit: fixed for a whole video."""
 
@@ -56,11 +56,11 @@ def render_channels(
 
 
 def render_channel(rendered: RenderOutput, channel: str, style: FrameStyle) -> Float[Tensor, "R C"]:
-    """Colours of one channel, of rays rendered on the style's background (black for a transparent one)."""
+    """Colors of one channel, of rays rendered on the style's background (black for a transparent one)."""
     opacity = rendered.opacity[:, None]
     if channel == "opacity":
-        grey = opacity.expand(-1, 3)
-        return grey if style.background is not None else torch.cat([grey, torch.ones_like(opacity)], dim=1)
+        gray = opacity.expand(-1, 3)
+        return gray if style.background is not None else torch.cat([gray, torch.ones_like(opacity)], dim=1)
     if channel == "rgb":
         premultiplied = rendered.rgb  # rendered on black
     else:

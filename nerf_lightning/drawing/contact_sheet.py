@@ -29,7 +29,7 @@ def make_contact_sheet(
     """Arranges images row by row on a white sheet.
 
     Args:
-        images: None draws a grey box; an empty list gives the heading alone.
+        images: None draws a gray box; an empty list gives the heading alone.
         captions: one per image, wrapped to its width.
         columns: most images side by side.
         width: of the sheet in pixels, to which images are scaled; None keeps the images' sizes.
@@ -72,7 +72,7 @@ def make_contact_sheet(
 
 
 def fit_image(image: UInt8[ndarray, "H W 3"], width: int, height: int) -> UInt8[ndarray, "h w 3"]:
-    """Scales an image to fit a box: area-averaged if smaller, nearest neighbour if larger."""
+    """Scales an image to fit a box: area-averaged if smaller, nearest neighbor if larger."""
     rows, cols = image.shape[:2]
     scale = min(width / cols, height / rows)
     size = max(1, round(cols * scale)), max(1, round(rows * scale))

@@ -41,8 +41,8 @@ def depth_percentiles(depths: Float[ndarray, "*shape"]) -> tuple[float, float]:
 def colorize_depth(depth: Float[ndarray, "*shape"], low: float, high: float) -> UInt8[ndarray, "*shape 3"]:
     """Maps depths to the inferno colormap: bright at `low` and nearer, dark at `high` and farther."""
     nearness = 1 - (depth - low) / max(high - low, 1e-9)
-    grey = (nearness.clip(0, 1) * 255).astype(np.uint8).reshape(-1, 1)
-    return np.ascontiguousarray(cv2.applyColorMap(grey, cv2.COLORMAP_INFERNO)[..., ::-1]).reshape(*depth.shape, 3)
+    gray = (nearness.clip(0, 1) * 255).astype(np.uint8).reshape(-1, 1)
+    return np.ascontiguousarray(cv2.applyColorMap(gray, cv2.COLORMAP_INFERNO)[..., ::-1]).reshape(*depth.shape, 3)
 
 
 def make_panel(images: list[UInt8[ndarray, "H W 3"]], caption: str) -> UInt8[ndarray, "H2 W2 3"]:

@@ -14,22 +14,22 @@ NUM_BANDS = 64
 
 def zero_mean_luma(image: Float[np.ndarray, "H W 3"]) -> Float[np.ndarray, "H W"]:
     """Luma of sRGB (ITU-R BT.601), minus its mean."""
-    grey = image @ np.array([0.299, 0.587, 0.114], image.dtype)
-    return grey - grey.mean()
+    gray = image @ np.array([0.299, 0.587, 0.114], image.dtype)
+    return gray - gray.mean()
 
 
-def amplitude_spectrum(grey: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
-    """Amplitude of every frequency, zero in the centre; a Hann window keeps the borders from acting as edges."""
-    rows, cols = (np.hanning(side + 2)[1:-1].astype(grey.dtype) for side in grey.shape)
+def amplitude_spectrum(gray: Float[np.ndarray, "H W"]) -> Float[np.ndarray, "H W"]:
+    """Amplitude of every frequency, zero in the center; a Hann window keeps the borders from acting as edges."""
+    rows, cols = (np.hanning(side + 2)[1:-1].astype(gray.dtype) for side in gray.shape)
     # In the image's precision: in doubles, large ones take gigabytes.
-    amplitudes = np.abs(fft2(grey * rows[:, None] * cols))
-    return np.fft.fftshift(amplitudes) / np.sqrt((rows**2).sum() * (cols**2).sum() * grey.size, dtype=grey.dtype)
+    amplitudes = np.abs(fft2(gray * rows[:, None] * cols))
+    return np.fft.fftshift(amplitudes) / np.sqrt((rows**2).sum() * (cols**2).sum() * gray.size, dtype=gray.dtype)
 
 
 def radial_rms(
     spectrum: Float[np.ndarray, "H W"], bands: int = NUM_BANDS
 ) -> tuple[Float[np.ndarray, "B"], Float[np.ndarray, "B"]]:
-    """Centre of each radial band, cycles per pixel, and the RMS amplitude in it (nan for empty bands)."""
+    """Center of each radial band, cycles per pixel, and the RMS amplitude in it (nan for empty bands)."""
     freq_y, freq_x = (np.fft.fftshift(np.fft.fftfreq(n)) for n in spectrum.shape)
     radius = np.hypot(freq_y[:, None], freq_x)  # bands exclude the corners beyond 0.5
     count, power = (np.histogram(radius, bands, (0, 0.5), weights=weights)[0] for weights in (None, spectrum**2))
@@ -41,11 +41,11 @@ def plot_spectra(target: Float[np.ndarray, "H W 3"], result: Float[np.ndarray, "
     """Plots the spectra of target and result, and the radial amplitudes of both and of the error."""
     figure = Figure(figsize=(16, 5), dpi=DPI, layout="constrained")
     left, middle, right = figure.subplots(1, 3, width_ratios=(1, 1, 1.4))
-    greys = {"target": zero_mean_luma(target), "result": zero_mean_luma(result)}
-    greys["error"] = greys["result"] - greys["target"]
+    grays = {"target": zero_mean_luma(target), "result": zero_mean_luma(result)}
+    grays["error"] = grays["result"] - grays["target"]
     max_amplitude = 0.0  # of the target, which comes first
-    for (name, grey), color, axes in zip(greys.items(), (BLUE, ORANGE, VERMILLION), (left, middle, None), strict=True):
-        spectrum = amplitude_spectrum(grey)  # one at a time: each is as large as the image
+    for (name, gray), color, axes in zip(grays.items(), (BLUE, ORANGE, VERMILLION), (left, middle, None), strict=True):
+        spectrum = amplitude_spectrum(gray)  # one at a time: each is as large as the image
         max_amplitude = max_amplitude or max(float(spectrum.max()), 1e-9)
         frequency, amplitude = radial_rms(spectrum)
         right.semilogy(frequency, np.maximum(amplitude, max_amplitude * 1e-9), color=color, label=name)

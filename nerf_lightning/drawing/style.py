@@ -1,4 +1,4 @@
-"""Style of all figures: colours, font and scales."""
+"""Style of all figures: colors, font and scales."""
 
 import functools
 import itertools
@@ -11,20 +11,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import findfont, get_font
 
-BLUE, ORANGE, GREEN, SKY, VERMILLION, MAUVE, GREY = (
+BLUE, ORANGE, GREEN, SKY, VERMILLION, MAUVE, GRAY = (
     "#0072B2", "#E69F00", "#009E73", "#56B4E9", "#D55E00", "#CC79A7", "#6E6E6E",
 )  # fmt: skip
-"""Colour-blind safe palette (Okabe and Ito 2008); excluded items are vermillion."""
+"""Color-blind safe palette (Okabe and Ito 2008); excluded items are vermillion."""
 PALETTE = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "^"), (MAUVE, "D"), (SKY, "v"), ("#000000", "P"), ("#B8A000", "X"))
-"""Colours and markers of a chart's categories, in order."""
+"""Colors and markers of a chart's categories, in order."""
 FONT = "DejaVu Sans"
 """Ships with matplotlib."""
 DPI = 100
 
 
-def parse_hex_colour(colour: str) -> tuple[int, int, int]:
+def parse_hex_color(color: str) -> tuple[int, int, int]:
     """Parses "#RRGGBB" to bytes."""
-    red, green, blue = bytes.fromhex(colour[1:])
+    red, green, blue = bytes.fromhex(color[1:])
     return red, green, blue
 
 
@@ -34,7 +34,7 @@ def _font_glyphs() -> frozenset[int]:
 
 
 def assign_styles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
-    """Assigns a colour and a marker of `PALETTE` to each category, cyclically."""
+    """Assigns a color and a marker of `PALETTE` to each category, cyclically."""
     return dict(zip(dict.fromkeys(names), itertools.cycle(PALETTE), strict=False))
 
 

@@ -27,7 +27,7 @@ SH_DEGREE, MAX_DIRECTIONS = 1, 24
 RIDGE_DAMPING = 1e-2
 """Ridge regularization of that fit, per direction."""
 MAX_LOGIT = 6.0
-"""Largest logit of a colour: beyond, 8-bit values do not change."""
+"""Largest logit of a color: beyond, 8-bit values do not change."""
 MAX_VERTICES = 700_000
 """Limit for kept vertices (about 6 MB), unless the user sets the resolution."""
 CUBE_MARGIN = 1e-4
@@ -125,8 +125,8 @@ def bake_voxels(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
             break
         across = max(MIN_RESOLUTION, min(across - 1, int(across * math.sqrt(MAX_VERTICES / count))))
     chosen = keep[vertices]
-    centres = cameras.centres[torch.tensor(subsample(len(cameras), MAX_DIRECTIONS))].to(system.device)
-    parts = [fit_colors(system, part, centres, voxels.terms) for part in positions[chosen].split(CHUNK_VERTICES)]
+    centers = cameras.centers[torch.tensor(subsample(len(cameras), MAX_DIRECTIONS))].to(system.device)
+    parts = [fit_colors(system, part, centers, voxels.terms) for part in positions[chosen].split(CHUNK_VERTICES)]
     colors, views = (torch.cat(column) for column in zip(*parts, strict=True))
     raw = (density[chosen] * voxels.unit_length).log().clamp(EMPTY_LOG_DENSITY, 15.0) / voxels.density_lr_scale
     empty_row = (
@@ -172,7 +172,7 @@ def compute_cell_sizes(bounds: Bounds, positions: Float[Tensor, "N 3"], across: 
 
 
 def resample_occupancy(voxels: VoxelField, grid: int) -> CellMask:
-    """Marks cells of a grid of resolution `grid` that contain occupied voxels, and their neighbours."""
+    """Marks cells of a grid of resolution `grid` that contain occupied voxels, and their neighbors."""
     occupied = voxels.occupied.view(*[voxels.side] * 3).nonzero()
     x, y, z = (occupied * grid // (voxels.side - 1)).clamp(0, grid - 1).unbind(1)
     mask = torch.zeros(grid, grid, grid, dtype=torch.bool, device=occupied.device)
@@ -181,17 +181,17 @@ def resample_occupancy(voxels: VoxelField, grid: int) -> CellMask:
 
 
 def fit_colors(
-    system: NeRF3D, positions: Float[Tensor, "N 3"], centres: Float[Tensor, "D 3"], terms: int
+    system: NeRF3D, positions: Float[Tensor, "N 3"], centers: Float[Tensor, "D 3"], terms: int
 ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N C"]]:
-    """Fits the base colour and spherical harmonics of vertices to a field's colours, seen from camera centres:
+    """Fits the base color and spherical harmonics of vertices to a field's colors, seen from camera centers:
     ridge regression on logits."""
-    directions = torch.nn.functional.normalize(positions[:, None] - centres, dim=2)
+    directions = torch.nn.functional.normalize(positions[:, None] - centers, dim=2)
     repeated = positions[:, None].expand_as(directions).flatten(0, 1)
     rgb = system.field(repeated, directions.flatten(0, 1))[1].view(directions.shape)
     logits = torch.logit(rgb, 1 / (1 + math.exp(MAX_LOGIT)))
     basis = encode_directions(directions.flatten(0, 1), 1 + terms)[:, 1:].view(*directions.shape[:2], -1)
     mean, basis_mean = logits.mean(1, keepdim=True), basis.mean(1, keepdim=True)
     basis = basis - basis_mean
-    normal = basis.mT @ basis + RIDGE_DAMPING * len(centres) * torch.eye(terms, device=basis.device)
+    normal = basis.mT @ basis + RIDGE_DAMPING * len(centers) * torch.eye(terms, device=basis.device)
     views = torch.linalg.solve(normal, basis.mT @ (logits - mean))
     return mean[:, 0] - (basis_mean @ views)[:, 0], views.mT.flatten(1)

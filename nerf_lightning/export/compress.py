@@ -15,7 +15,7 @@ from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import DataModule
 from nerf_lightning.errors import InputError
 from nerf_lightning.model.layers.grid_masks import dilate
-from nerf_lightning.runs.compact import decode, encode
+from nerf_lightning.runs.compact import decode_run, encode_system
 from nerf_lightning.runs.scene_file import scene_to_dict
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D, System
@@ -42,7 +42,7 @@ def get_occupied_cells(system: System) -> CellMask | None:
 
 
 def find_seen_cells(system: NeRF3D, cameras: Cameras) -> CellMask | None:
-    """Occupied cells that are visible to the cameras, and their neighbours; None without an occupancy grid."""
+    """Occupied cells that are visible to the cameras, and their neighbors; None without an occupancy grid."""
     occupied = get_occupied_cells(system)
     if occupied is None:
         return None
@@ -54,7 +54,7 @@ def find_visible_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
     """Cells of an n^3 grid over the bounds in which any camera sees content; ray spacing matches the cells."""
     bounds = system.field.bounds
     cell = (4 if bounds.unbounded else 2) * bounds.max_half_size / n
-    factor = min(MAX_RAYS_PER_PIXEL_SIDE, math.ceil(cameras.pixel_footprint(bounds.centre.cpu()) / cell))
+    factor = min(MAX_RAYS_PER_PIXEL_SIDE, math.ceil(cameras.pixel_footprint(bounds.center.cpu()) / cell))
     supersampled = cameras.rescale(factor)
     seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
     for view in track_progress(range(len(supersampled)), len(supersampled), "views"):
@@ -138,8 +138,8 @@ def compress_system(
     attempts: list[CompactFile] = []
     for precision in PRECISIONS:
         for part in candidates:  # held-out views may see more than few photos do
-            content = encode(part, precision, config, scene)
-            small = decode(content, "compact", system.device).system
+            content = encode_system(part, precision, config, scene)
+            small = decode_run(content, "compact", system.device).system
             attempts.append(CompactFile(content, precision, measure_held_out_psnr(small, data), before))
             if attempts[-1].psnr_drop <= max_psnr_drop:
                 return attempts[-1]

@@ -33,7 +33,7 @@ FLOAT32_ROUNDOFF = 2.0**-24
 MAX_RELATIVE_ERROR = 1e-4
 """Largest rounding error of a vertex, relative to the mesh's longest side: a fortieth of the finest cell."""
 OBJ_DIGITS, OBJ_COLOR_DECIMALS = 9, 4
-"""Significant digits of OBJ coordinates, relative to the mesh's longest side, and decimals of colours."""
+"""Significant digits of OBJ coordinates, relative to the mesh's longest side, and decimals of colors."""
 
 
 class ExportedFile(NamedTuple):
@@ -59,7 +59,7 @@ def select_training_views(run: LoadedSceneRun, photos: Path | None = None) -> Ca
 def query_colors(
     system: NeRF3D, positions: Float[Tensor, "N 3"], outwards: Float[Tensor, "N 3"]
 ) -> UInt8[ndarray, "N 3"]:
-    """Colours of a field at world positions, seen from outside along `outwards`."""
+    """Colors of a field at world positions, seen from outside along `outwards`."""
     batch_size = POSITIONS_PER_SAMPLE * system.chunk
     parts = [
         system.field(points.to(system.device), -normals.to(system.device))[1].cpu()
@@ -71,13 +71,13 @@ def query_colors(
 def extract_mesh(
     run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None
 ) -> tuple["trimesh.Trimesh", Surface]:
-    """Extracts the surface visible to cameras, with vertex colours, in the dataset's frame."""
+    """Extracts the surface visible to cameras, with vertex colors, in the dataset's frame."""
     import trimesh
 
     surface = extract_surface(volume, find_unoccluded_cells(run.system, volume, cameras), threshold)
     normals = torch.from_numpy(surface.normals)
     positions = torch.from_numpy(surface.vertices)
-    # Half a cell inside: photos do not constrain the colour outside the surface.
+    # Half a cell inside: photos do not constrain the color outside the surface.
     rgb = query_colors(run.system, positions - normals * (volume.cell / 2), normals)
     mesh = trimesh.Trimesh(surface.vertices, surface.faces, vertex_colors=rgb, process=False)
     mesh.apply_transform(run.to_source.numpy())
@@ -87,7 +87,7 @@ def extract_mesh(
 def build_mesh_file(
     run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None, suffix: str
 ) -> ExportedFile:
-    """Builds a coloured mesh as .ply, .obj or .glb, or triangles only as .stl."""
+    """Builds a colored mesh as .ply, .obj or .glb, or triangles only as .stl."""
     mesh, surface = extract_mesh(run, cameras, volume, threshold)
     content = encode_mesh(mesh, suffix, run.to_source[:3, :3].T.numpy() / run.scale)
     description = [
@@ -101,7 +101,7 @@ def build_mesh_file(
 
 
 def build_points_file(run: LoadedSceneRun, cameras: Cameras, volume: Volume, threshold: float | None) -> ExportedFile:
-    """Builds a .ply file of the mesh's vertices and colours."""
+    """Builds a .ply file of the mesh's vertices and colors."""
     mesh, surface = extract_mesh(run, cameras, volume, threshold)
     colors: Any = mesh.visual
     content = encode_ply(mesh.vertices, colors.vertex_colors[:, :3])
@@ -109,10 +109,10 @@ def build_points_file(run: LoadedSceneRun, cameras: Cameras, volume: Volume, thr
 
 
 def build_voxels_file(run: LoadedSceneRun, volume: Volume) -> ExportedFile:
-    """Builds an .npz file of density and colour.
+    """Builds an .npz file of density and color.
 
-    `density` [X, Y, Z] is per unit of the dataset's frame, `rgb` [X, Y, Z, 3] the colour seen along the density gradient,
-    `to_source` [4, 4] maps indices (integers are cell centres) to the dataset's frame.
+    `density` [X, Y, Z] is per unit of the dataset's frame, `rgb` [X, Y, Z, 3] the color seen along the density gradient,
+    `to_source` [4, 4] maps indices (integers are cell centers) to the dataset's frame.
     """
     solid = volume.density > 0
     index = solid.nonzero()
@@ -139,7 +139,7 @@ def encode_ply(vertices: Float[ndarray, "V 3"], rgb: UInt8[ndarray, "V 3"], face
 
     Args:
         vertices: in the file's frame.
-        rgb: vertex colours.
+        rgb: vertex colors.
         faces: [F, 3] vertex indices; None for a point cloud.
     """
     channels = ("red", "green", "blue")
@@ -155,12 +155,12 @@ def encode_ply(vertices: Float[ndarray, "V 3"], rgb: UInt8[ndarray, "V 3"], face
 
 
 def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, rotation: Float[ndarray, "3 3"]) -> bytes:
-    """Encodes a coloured mesh as .ply, .obj, .stl or .glb.
+    """Encodes a colored mesh as .ply, .obj, .stl or .glb.
 
-    GLB stores float32: vertices are relative to the mesh's centre, and the node's transform restores it.
+    GLB stores float32: vertices are relative to the mesh's center, and the node's transform restores it.
 
     Args:
-        mesh: with vertex colours.
+        mesh: with vertex colors.
         suffix: of the file.
         rotation: to z up of a GLB file's node.
 
@@ -184,10 +184,10 @@ def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, rotation: Float[ndarray, "
         return content
     import trimesh
 
-    centre, centred = mesh.vertices.mean(0), mesh.copy()
-    centred.vertices = mesh.vertices - centre
+    center, centered = mesh.vertices.mean(0), mesh.copy()
+    centered.vertices = mesh.vertices - center
     scene, node = trimesh.Scene(), np.eye(4)
-    node[:3, :3], node[:3, 3] = Y_UP @ rotation, Y_UP @ centre
-    scene.add_geometry(centred, transform=node)
+    node[:3, :3], node[:3, 3] = Y_UP @ rotation, Y_UP @ center
+    scene.add_geometry(centered, transform=node)
     content = scene.export(file_type="glb")
     return content

@@ -52,7 +52,7 @@ def compute_otsu_threshold(values: Float[ndarray, "N"]) -> float:
     low, high = float(values.min()), float(values.max())
     if len(np.flatnonzero(np.histogram(values, HISTOGRAM_BINS)[0])) < 3:
         return (low + high) / 2 if low < high else high / 2
-    # scikit-image returns the centre of a bin that belongs below the threshold.
+    # scikit-image returns the center of a bin that belongs below the threshold.
     threshold = threshold_multiotsu(values, 3, HISTOGRAM_BINS)[1] + (high - low) / HISTOGRAM_BINS / 2
     # Between two separate classes, take the middle of the gap.
     above = values > threshold
@@ -68,22 +68,22 @@ def find_unoccluded_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> B
         volume: grid of cells.
         cameras: training views.
     """
-    centres = volume.centres.view(-1, 3)
-    occluded = torch.arange(len(centres))
+    centers = volume.centers.view(-1, 3)
+    occluded = torch.arange(len(centers))
     cameras = cameras.rescale(min(1.0, MAX_VISIBILITY_SIDE / cameras.max_side))
     # A slanted surface has many depths within a pixel: the tolerance is at least the pixel's width.
-    tolerance = max(volume.cell, CELL_WIDTH_PIXELS * cameras.pixel_footprint(system.field.bounds.centre.cpu()))
+    tolerance = max(volume.cell, CELL_WIDTH_PIXELS * cameras.pixel_footprint(system.field.bounds.center.cpu()))
     for view in track_progress(range(len(cameras)), len(cameras), "views"):
         rendered = system.render(cameras.generate_view_rays(view).to(system.device))
         depths = torch.where(rendered.opacity > 0.5, rendered.depth, MISS_DISTANCE).cpu() + tolerance
-        # At silhouettes, depth averages near and far: dilate by the 3 x 3 neighbourhood.
+        # At silhouettes, depth averages near and far: dilate by the 3 x 3 neighborhood.
         width, height = cameras.size(view)
         depths = -torch.nn.functional.max_pool2d(-depths.view(1, height, width), 3, 1, 1).flatten()
-        pixels, _, seen = cameras.project(centres[occluded], view)
+        pixels, _, seen = cameras.project(centers[occluded], view)
         col, row = torch.where(seen[:, None], pixels, 0.0).long().unbind(1)
         max_distance = torch.where(seen, depths[row * width + col], 0.0)
-        occluded = occluded[(centres[occluded] - cameras.centres[view]).norm(dim=1) > max_distance]
-    unoccluded = torch.ones(len(centres), dtype=torch.bool)
+        occluded = occluded[(centers[occluded] - cameras.centers[view]).norm(dim=1) > max_distance]
+    unoccluded = torch.ones(len(centers), dtype=torch.bool)
     unoccluded[occluded] = False
     return unoccluded.view(volume.density.shape).numpy()
 

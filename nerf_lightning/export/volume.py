@@ -21,12 +21,12 @@ CELL_WIDTH_PIXELS = 1.25
 POSITIONS_PER_SAMPLE = 4
 """Positions per field query, relative to the system's sample chunk: bounds the memory."""
 BYTES_PER_CELL = 32
-"""Memory per cell: density, opacity, index and centre."""
+"""Memory per cell: density, opacity, index and center."""
 
 
 @dataclass(frozen=True)
 class Volume:
-    """A grid of densities. Cell (i, j, k) is centred at low + (i + 0.5, j + 0.5, k + 0.5) * cell, world frame."""
+    """A grid of densities. Cell (i, j, k) is centered at low + (i + 0.5, j + 0.5, k + 0.5) * cell, world frame."""
 
     density: Float[Tensor, "X Y Z"]
     """1 / world unit."""
@@ -40,20 +40,20 @@ class Volume:
         return 1 - torch.exp(-self.density * self.cell)
 
     def index_to_world(self, index: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """World positions of indices; integers are cell centres."""
+        """World positions of indices; integers are cell centers."""
         return self.low + (index + 0.5) * self.cell
 
     @property
     def to_world(self) -> Float[Tensor, "4 4"]:
-        """Index-to-world matrix, float64; integers are cell centres."""
+        """Index-to-world matrix, float64; integers are cell centers."""
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3, :3] *= self.cell
         matrix[:3, 3] = self.low.double() + self.cell / 2
         return matrix
 
     @property
-    def centres(self) -> Float[Tensor, "X Y Z 3"]:
-        """World positions of all cell centres."""
+    def centers(self) -> Float[Tensor, "X Y Z 3"]:
+        """World positions of all cell centers."""
         axes = [torch.arange(count).float() for count in self.density.shape]
         return self.index_to_world(torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1))
 
@@ -113,7 +113,7 @@ def sample_volume(
     occupied = get_occupied_cells(system)
     batch_size = POSITIONS_PER_SAMPLE * system.chunk
     density = []
-    for part in track_progress(volume.centres.view(-1, 3).split(batch_size), math.ceil(count / batch_size), "cells"):
+    for part in track_progress(volume.centers.view(-1, 3).split(batch_size), math.ceil(count / batch_size), "cells"):
         positions = part.to(system.device)
         unit = bounds.to_unit(positions)
         mask = ((unit >= 0) & (unit <= 1)).all(1)

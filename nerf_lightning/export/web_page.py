@@ -27,7 +27,7 @@ IMAGE_SCRIPTS = [WEB / "common.js", WEB / "picture.js"]
 MAX_RAY_DISTANCE = 1e9
 """Far distance of unlimited rays, world units."""
 MIN_WEIGHT = 1e-4
-"""Weight below which a sample's colour is skipped: a few dozen of them do not change 8-bit values."""
+"""Weight below which a sample's color is skipped: a few dozen of them do not change 8-bit values."""
 FRUSTUM_DEPTH_FRACTION = 0.06
 """Depth of a photo's frustum, relative to the cameras' distance to the focus."""
 NON_FILENAME_CHARS = re.compile(r"[^\w.-]+")
@@ -95,7 +95,7 @@ def describe_field(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
 
 def describe_photos(cameras: Cameras, names: Sequence[str], focus: Float[Tensor, "3"]) -> dict[str, Any]:
     """Cameras of photos, and the depth of their frusta."""
-    depth = FRUSTUM_DEPTH_FRACTION * float((cameras.centres - focus).norm(dim=1).median())
+    depth = FRUSTUM_DEPTH_FRACTION * float((cameras.centers - focus).norm(dim=1).median())
     return {"names": list(names), "depth": depth, **encode_cameras(cameras.to_pinhole())}
 
 

@@ -12,7 +12,7 @@ from nerf_lightning.kernels.march import Packed, first_true_indices, offsets_fro
 from nerf_lightning.kernels.segment_sums import exclusive_sum
 
 CompositedRays = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
-"""Weighted sums of colour, opacity and distance along each ray."""
+"""Weighted sums of color, opacity and distance along each ray."""
 VisibleSamples = tuple[
     Float[Tensor, "K"], tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
 ]
@@ -44,24 +44,24 @@ def composite_reference(
     weights = volume_weights(density, dt, ray, offsets)
     values = torch.cat([rgb, torch.ones_like(weights)[:, None], t[:, None]], dim=1)
     sums = values.new_zeros(len(offsets) - 1, 5).index_add(0, ray, weights[:, None] * values)
-    colour, opacity, distance = sums.split([3, 1, 1], dim=1)
-    return colour, opacity.squeeze(1), distance.squeeze(1)
+    color, opacity, distance = sums.split([3, 1, 1], dim=1)
+    return color, opacity.squeeze(1), distance.squeeze(1)
 
 
 class _Composite(torch.autograd.Function):
     @staticmethod
     def forward(ctx, density: Tensor, rgb: Tensor, t: Tensor, dt: Tensor, offsets: Tensor) -> CompositedRays:
         rays, density, rgb = len(offsets) - 1, density.contiguous(), rgb.T.contiguous()
-        colour, opacity, depth = torch.empty(3, rays), torch.empty(rays), torch.empty(rays)
+        color, opacity, depth = torch.empty(3, rays), torch.empty(rays), torch.empty(rays)
         transmittance = torch.empty(len(t))
-        cpu.composite.forward(density, rgb, t, dt, offsets, colour, opacity, depth, transmittance)
+        cpu.composite.forward(density, rgb, t, dt, offsets, color, opacity, depth, transmittance)
         ctx.save_for_backward(density, rgb, t, dt, offsets, transmittance)
-        return colour.T, opacity, depth
+        return color.T, opacity, depth
 
     @staticmethod
-    def backward(ctx, colour: Tensor, opacity: Tensor, depth: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx, color: Tensor, opacity: Tensor, depth: Tensor) -> tuple[Tensor | None, ...]:
         density, rgb = (torch.empty_like(x) for x in ctx.saved_tensors[:2])
-        cpu.composite.backward(*ctx.saved_tensors, colour.T, opacity, depth, density, rgb)
+        cpu.composite.backward(*ctx.saved_tensors, color.T, opacity, depth, density, rgb)
         return density, rgb.T, None, None, None
 
 
@@ -73,15 +73,15 @@ def composite(
     ray: Int[Tensor, "N"],
     offsets: Int[Tensor, "R_plus_1"],
 ) -> CompositedRays:
-    """Composites colour, opacity and distance along each ray by the weights of `volume_weights`.
+    """Composites color, opacity and distance along each ray by the weights of `volume_weights`.
 
     Args:
         density, dt, ray, offsets: see `volume_weights`.
-        rgb: colour of each sample.
+        rgb: color of each sample.
         t: distance of each sample along its ray.
 
     Returns:
-        Colour without background, opacity in [0, 1], and the sum of distances (not divided by opacity).
+        Color without background, opacity in [0, 1], and the sum of distances (not divided by opacity).
     """
     if has_fast_kernel(density, rgb, constants=(t, dt)):
         return _Composite.apply(density, rgb, t, dt, offsets)

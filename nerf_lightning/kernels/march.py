@@ -157,7 +157,7 @@ class RayMarcher:
         self.ray_limits, self.shape = (near, far, inside, shift), (bounds.half_size, bounds.unbounded)
         self.steps = samples, np.float32(step)
         grid = occupied, resolution, blocks, cells
-        self.arguments = rays.origins, rays.directions, *self.ray_limits, *grid, bounds.centre, *self.shape, *self.steps
+        self.arguments = rays.origins, rays.directions, *self.ray_limits, *grid, bounds.center, *self.shape, *self.steps
         self.next_interval = torch.zeros(len(rays), dtype=torch.int32)
         """Interval at which each ray continues."""
 
@@ -207,6 +207,6 @@ def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions
     """Writes `mark` into the cells of a cubic grid over the bounds at world positions."""
     resolution = round(len(marks) ** (1 / 3))
     if has_fast_kernel(positions):
-        cpu.march.mark_cells(positions.T, bounds.centre, bounds.half_size, bounds.unbounded, marks, resolution, mark)
+        cpu.march.mark_cells(positions.T, bounds.center, bounds.half_size, bounds.unbounded, marks, resolution, mark)
     else:
         marks.index_fill_(0, cell_index(bounds.to_unit(positions), resolution), mark)

@@ -1,4 +1,4 @@
-"""Merging of low-weight samples with their neighbour before colour evaluation."""
+"""Merging of low-weight samples with their neighbor before color evaluation."""
 
 import torch
 from jaxtyping import Float
@@ -42,7 +42,7 @@ def merge_low_weight(optical_depth: Float[Tensor, "N"], packed: Packed, min_weig
     """Merges a sample into its predecessor if the weight of either is below `min_weight`, at most two into one.
 
     The merged interval has the summed length and optical depth, which preserves opacity, and the weighted mean of t, which
-    preserves depth. Only the colour is evaluated at one position instead of two.
+    preserves depth. Only the color is evaluated at one position instead of two.
 
     Args:
         optical_depth: optical depth of each sample, density times length.

@@ -23,7 +23,7 @@ def mlp_reference(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, 
     return linear(h, *layers[-1])
 
 
-def _padded(width: int) -> int:
+def _pad(width: int) -> int:
     return -(-width // 4) * 4
 
 
@@ -31,7 +31,7 @@ def _blocks(shapes: list[tuple[int, int]], row: np.ndarray) -> list[tuple[np.nda
     """Views of matrices and biases in a flat array with all widths padded to multiples of 4."""
     blocks, start = [], 0
     for outputs, inputs in shapes:
-        o, i = _padded(outputs), _padded(inputs)
+        o, i = _pad(outputs), _pad(inputs)
         matrix = row[start : start + o * i].reshape(o, i)[:outputs, :inputs]
         blocks.append((matrix, row[start + o * i :][:outputs]))
         start += o * i + o
@@ -42,7 +42,7 @@ class _MLP(torch.autograd.Function):
     @staticmethod
     def forward(ctx, x: Tensor, extra: Tensor, num_head: int, *flat: Tensor) -> tuple[Tensor, Tensor]:
         shapes = [(len(matrix), matrix.shape[1]) for matrix in flat[::2]]
-        widths = np.array([_padded(n) for n in (shapes[0][1], *(outputs for outputs, _ in shapes))])
+        widths = np.array([_pad(n) for n in (shapes[0][1], *(outputs for outputs, _ in shapes))])
         row = np.zeros((widths[1:] * (widths[:-1] + 1)).sum(), np.float32)
         for block, matrix, bias in zip(_blocks(shapes, row), flat[::2], flat[1::2], strict=True):
             block[0][:], block[1][:] = matrix.detach().numpy(), bias.detach().numpy()

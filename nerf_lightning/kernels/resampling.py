@@ -39,7 +39,7 @@ def interval_midpoints(
     count, steps = len(s), s.shape[1] - 1
     inside = bounds.content_interval(rays) if bounds.unbounded else torch.empty(0, 2)
     unit, t, dt = torch.empty(3, count * steps), torch.empty(count, steps), torch.empty(count, steps)
-    box = bounds.centre, bounds.half_size, bounds.unbounded
+    box = bounds.center, bounds.half_size, bounds.unbounded
     cpu.resampling.interval_midpoints(rays.origins, rays.directions, near, far, inside, s, *box, unit, t, dt)
     return unit.T, t, dt
 

@@ -103,21 +103,21 @@ def interpolate_scalar(
 class _InterpolateVoxels(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx, density: Tensor, colour: Tensor, sh_coefficients: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
+        ctx, density: Tensor, color: Tensor, sh_coefficients: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
     ) -> tuple[Tensor, Tensor]:
         raw, rgb, basis = torch.empty(len(rows)), torch.empty(3, len(rows)), basis.T.contiguous()
-        cpu.voxels.read(density, colour, rows, weights, raw, rgb)
+        cpu.voxels.read(density, color, rows, weights, raw, rgb)
         if len(basis):
-            cpu.voxels.add_sh_colour(sh_coefficients, rows, weights, basis, rgb, (0,) * len(basis))
-        ctx.save_for_backward(density, colour, sh_coefficients, rows, weights, basis)
+            cpu.voxels.add_sh_color(sh_coefficients, rows, weights, basis, rgb, (0,) * len(basis))
+        ctx.save_for_backward(density, color, sh_coefficients, rows, weights, basis)
         return raw, rgb.T
 
     @staticmethod
     def backward(ctx, raw: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, Tensor, None, Tensor | None, None]:
         *tables, rows, weights, basis = ctx.saved_tensors
         rgb, grad_weights, lanes = rgb.T.contiguous(), None, (0,) * len(basis)
-        density, colour, sh_coefficients = (torch.zeros(table.shape) for table in tables)
-        cpu.voxels.scatter(density, colour, rows, weights, raw, rgb)
+        density, color, sh_coefficients = (torch.zeros(table.shape) for table in tables)
+        cpu.voxels.scatter(density, color, rows, weights, raw, rgb)
         if lanes:
             cpu.voxels.scatter_sh(sh_coefficients, rows, weights, basis, rgb, lanes)
         if ctx.needs_input_grad[4]:
@@ -125,38 +125,38 @@ class _InterpolateVoxels(torch.autograd.Function):
             cpu.voxels.weight_gradient(*tables[:2], rows, raw, rgb, grad_weights)
             if lanes:
                 cpu.voxels.add_sh_weight_gradient(tables[2], rows, basis, rgb, grad_weights, lanes)
-        return density, colour, sh_coefficients, None, grad_weights, None
+        return density, color, sh_coefficients, None, grad_weights, None
 
 
 def interpolate_voxels_reference(
-    density: Tensor, colour: Tensor, sh_coefficients: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
+    density: Tensor, color: Tensor, sh_coefficients: Tensor, rows: Tensor, weights: Tensor, basis: Tensor
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
     """`interpolate_voxels` in plain PyTorch, for every device and differentiable in weights and basis too."""
     # Concatenated for a single gather.
-    corner_values = interpolate_rows(torch.cat([density[:, None], colour, sh_coefficients], dim=1), rows, weights)
+    corner_values = interpolate_rows(torch.cat([density[:, None], color, sh_coefficients], dim=1), rows, weights)
     raw, rgb, mixed = corner_values.split([1, 3, sh_coefficients.shape[1]], dim=1)
     return raw[:, 0], rgb + (mixed.unflatten(1, (3, -1)) * basis[:, None]).sum(2)
 
 
 def interpolate_voxels(
     density: Float[Tensor, "V"],
-    colour: Float[Tensor, "V 3"],
+    color: Float[Tensor, "V 3"],
     sh_coefficients: Float[Tensor, "V C"],
     rows: Int[Tensor, "N 8"],
     weights: Float[Tensor, "N 8"],
     basis: Float[Tensor, "N B"],
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N 3"]]:
-    """Interpolates density and view-dependent colour.
+    """Interpolates density and view-dependent color.
 
     Args:
-        density, colour: values per row.
-        sh_coefficients: C = 3 B coefficients of the colour's view-dependent part, red first.
+        density, color: values per row.
+        sh_coefficients: C = 3 B coefficients of the color's view-dependent part, red first.
         rows, weights: output of `locate_vertices`.
         basis: basis functions at each sample's direction, without gradient.
     """
-    if has_fast_kernel(density, colour, sh_coefficients, weights, constants=(basis,)):
-        return _InterpolateVoxels.apply(density, colour, sh_coefficients, rows, weights, basis)
-    return interpolate_voxels_reference(density, colour, sh_coefficients, rows, weights, basis)
+    if has_fast_kernel(density, color, sh_coefficients, weights, constants=(basis,)):
+        return _InterpolateVoxels.apply(density, color, sh_coefficients, rows, weights, basis)
+    return interpolate_voxels_reference(density, color, sh_coefficients, rows, weights, basis)
 
 
 class _TotalVariation(torch.autograd.Function):
@@ -175,8 +175,8 @@ class _TotalVariation(torch.autograd.Function):
 
 
 @cache_constants
-def _neighbours(side: int, device: torch.device) -> tuple[Int[Tensor, "6 1"], ...]:
-    """For the six neighbours: stride of the axis, signed stride, and the coordinate without that neighbour."""
+def _neighbors(side: int, device: torch.device) -> tuple[Int[Tensor, "6 1"], ...]:
+    """For the six neighbors: stride of the axis, signed stride, and the coordinate without that neighbor."""
     strides = torch.tensor([side * side, side, 1], device=device).repeat(2)[:, None]
     signs = torch.tensor([-1, 1], device=device).repeat_interleave(3)[:, None]
     return strides, strides * signs, (signs > 0) * (side - 1)
@@ -187,20 +187,20 @@ def total_variation_reference(
 ) -> Float[Tensor, ""]:
     """`total_variation` in plain PyTorch, for every device."""
     side, at = grid_side(index), vertex_of_row[first:last].long()
-    strides, signed_strides, ends = _neighbours(side, index.device)
+    strides, signed_strides, ends = _neighbors(side, index.device)
     exists = at // strides % side != ends
-    # Row 0 also stands for missing neighbours.
-    neighbours = index.index_select(0, (at + signed_strides * exists).flatten()).view(exists.shape) * exists
-    differences = values[first:last] - values.detach().index_select(0, neighbours.flatten()).view(exists.shape)
-    return (differences.square() * (neighbours > 0)).sum() / (last - first)
+    # Row 0 also stands for missing neighbors.
+    neighbors = index.index_select(0, (at + signed_strides * exists).flatten()).view(exists.shape) * exists
+    differences = values[first:last] - values.detach().index_select(0, neighbors.flatten()).view(exists.shape)
+    return (differences.square() * (neighbors > 0)).sum() / (last - first)
 
 
 def total_variation(
     values: Float[Tensor, "V"], vertex_of_row: Int[Tensor, "V"], index: Int[Tensor, "cells"], first: int, last: int
 ) -> Float[Tensor, ""]:
-    """Total variation, mean over rows `first` to `last`: squared differences to the six neighbours that are not pruned.
+    """Total variation, mean over rows `first` to `last`: squared differences to the six neighbors that are not pruned.
 
-    Neighbours are detached, so that the gradients of consecutive slices sum to the gradient of the whole table.
+    Neighbors are detached, so that the gradients of consecutive slices sum to the gradient of the whole table.
 
     Args:
         values: value per row; row 0 is shared by pruned vertices.

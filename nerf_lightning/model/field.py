@@ -25,7 +25,7 @@ class FieldOutput(NamedTuple):
     rgb: Float[Tensor, "N 3"]
     """In [0, 1]."""
     view_residual: Float[Tensor, "N 3"] | None = None
-    """View-dependent part of the colour logits (SNeRG, Hedman et al. 2021); None if the field does not separate it."""
+    """View-dependent part of the color logits (SNeRG, Hedman et al. 2021); None if the field does not separate it."""
 
 
 class BaseField(torch.nn.Module):
@@ -64,7 +64,7 @@ class BaseField(torch.nn.Module):
 
 
 class Field(BoundedModule, BaseField):
-    """A radiance field in world coordinates. Subclasses define `features` and `colour`, or `density` and `forward`.
+    """A radiance field in world coordinates. Subclasses define `features` and `color`, or `density` and `forward`.
 
     Networks work in units of the bounds' half-size; `forward` and `density` convert to 1 / world unit, so that training does
     not depend on the scene's unit of length. A field with a `growth` schedule defines `stage` and `upsample`.
@@ -95,18 +95,18 @@ class Field(BoundedModule, BaseField):
         return min(base_resolution, max_cells), min(max_resolution, max_cells)
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        """World positions -> density (1 / half-size, not negative) and the features that `colour` reads."""
+        """World positions -> density (1 / half-size, not negative) and the features that `color` reads."""
         raise TypeError(f"{type(self).__name__} must define features(positions)")
 
-    def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def color(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         """Features and unit directions -> rgb in [0, 1]."""
-        raise TypeError(f"{type(self).__name__} must define colour(features, directions)")
+        raise TypeError(f"{type(self).__name__} must define color(features, directions)")
 
     def upsample(self, stage: int) -> list[torch.nn.Parameter]:
         """Upsamples to the resolution of a later stage of `growth`, preserving the function as far as possible.
 
         Returns:
-            Parameters whose shape changed: the optimiser's state for them must be reset.
+            Parameters whose shape changed: the optimizer's state for them must be reset.
         """
         raise TypeError(f"{type(self).__name__} must define upsample(stage)")
 
@@ -122,9 +122,9 @@ class Field(BoundedModule, BaseField):
         return self.features(positions)[0] / self.unit_length
 
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
-        """World positions and unit directions -> density and colour."""
+        """World positions and unit directions -> density and color."""
         density, features = self.features(positions)
-        return FieldOutput(density / self.unit_length, self.colour(features, directions))
+        return FieldOutput(density / self.unit_length, self.color(features, directions))
 
 
 class PictureField(BaseField):
@@ -145,8 +145,8 @@ class PictureField(BaseField):
         """Nyquist frequency of the pixels, in cycles over the picture's longer side."""
         return max(self.size) / 2
 
-    def centred(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
-        """Positions with the picture's centre at the origin and its longer side from -1 to 1: pixels stay square."""
+    def centered(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 2"]:
+        """Positions with the picture's center at the origin and its longer side from -1 to 1: pixels stay square."""
         return (2 * uv - 1) * uv.new_tensor([side / max(self.size) for side in self.size])
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:

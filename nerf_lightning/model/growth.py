@@ -47,7 +47,7 @@ class ResolutionSchedule:
 
 
 def replace_data(parameter: torch.nn.Parameter, data: Tensor) -> None:
-    """Replaces a parameter's data by a tensor of another shape; modules and optimisers keep the parameter object."""
+    """Replaces a parameter's data by a tensor of another shape; modules and optimizers keep the parameter object."""
     parameter.grad = None
     # Autograd caches the parameter's shape while a graph uses it; assigning a tensor of another dtype first clears it.
     parameter.data = data.new_empty(0, dtype=torch.float16)

@@ -95,17 +95,17 @@ class HashGrid(torch.nn.Module):
 
 
 class HashGridField(Field):
-    """Hash-grid features, a small density network, and a small view-dependent colour network (Instant-NGP).
+    """Hash-grid features, a small density network, and a small view-dependent color network (Instant-NGP).
 
     Args:
         bounds: the box the grid covers.
         num_levels: number of grids.
         log2_hashmap_size, features_per_level: see `HashGrid`.
         base_resolution, max_resolution: cells along a side of the first and the last grid.
-        width: neurons of the hidden layers (one for density, two for colour).
+        width: neurons of the hidden layers (one for density, two for color).
         degree: see `TensoRFField`.
-        view_residual: predict a diffuse colour from the position and add a view-dependent residual (SNeRG, Hedman et al.
-            2021); otherwise one view-dependent colour.
+        view_residual: predict a diffuse color from the position and add a view-dependent residual (SNeRG, Hedman et al.
+            2021); otherwise one view-dependent color.
         density: "relu", "softplus" or "exp".
         size: "auto" limits both resolutions to what the photos resolve; "fixed" does not.
 
@@ -113,7 +113,7 @@ class HashGridField(Field):
         InputError: where base_resolution > max_resolution.
     """
 
-    GEOMETRY_FEATURES = 15  # passed from the density to the colour network, Instant-NGP section 5.4
+    GEOMETRY_FEATURES = 15  # passed from the density to the color network, Instant-NGP section 5.4
     INIT_LOG_DENSITY = -1.0  # an exponential density starts as thin fog
     max_lr = 0.1
 
@@ -138,7 +138,7 @@ class HashGridField(Field):
         self.density_net = build_layers(self.grid.width, width, 1 + self.GEOMETRY_FEATURES)
         self.terms = num_sh_bases(degree)
         self.view_residual = view_residual
-        self.colour_net = build_layers(self.GEOMETRY_FEATURES + self.terms, width, width, 3)
+        self.color_net = build_layers(self.GEOMETRY_FEATURES + self.terms, width, width, 3)
         self.has_exp_density = density == "exp"
         self.reset_parameters()
 
@@ -154,7 +154,7 @@ class HashGridField(Field):
         if self.view_residual != smaller.view_residual or (columns := self.grid.warm_start_from(smaller.grid)) is None:
             return
         widen(linear_layers(self.density_net), linear_layers(smaller.density_net), columns)
-        widen(linear_layers(self.colour_net), linear_layers(smaller.colour_net))
+        widen(linear_layers(self.color_net), linear_layers(smaller.color_net))
 
     def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
         self.grid.prune(visible_cells)
@@ -166,7 +166,7 @@ class HashGridField(Field):
 
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
         density, features = self.features(positions)
-        logits = mlp(features, layer_parameters(self.colour_net), encode_directions(directions, self.terms))
+        logits = mlp(features, layer_parameters(self.color_net), encode_directions(directions, self.terms))
         if not self.view_residual:
             return FieldOutput(density / self.unit_length, torch.sigmoid(logits))
         return FieldOutput(density / self.unit_length, torch.sigmoid(features[:, :3] + logits), logits)

@@ -18,7 +18,7 @@ PER_LEVEL_SCALE = 2.4
 
 
 class HashGrid2DField(PictureField):
-    """Hash-grid features of a position and a colour network. The finest level has a vertex at every pixel centre.
+    """Hash-grid features of a position and a color network. The finest level has a vertex at every pixel center.
 
     Args:
         size: see `PictureField`.

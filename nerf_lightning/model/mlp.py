@@ -14,7 +14,7 @@ from nerf_lightning.utils.option_checks import Count, Frequencies, Layers
 
 
 class MLPField(Field):
-    """A deep MLP on the sinusoidally encoded position, with a view-dependent colour head.
+    """A deep MLP on the sinusoidally encoded position, with a view-dependent color head.
 
     Args:
         bounds: the box whose positions are scaled to [-1, 1].
@@ -53,7 +53,7 @@ class MLPField(Field):
         self.trunk = torch.nn.ModuleList(torch.nn.Linear(n, width) for n in inputs)
         self.density_head = torch.nn.Linear(width, 1)
         self.bottleneck = torch.nn.Linear(width, width)
-        self.colour_head = torch.nn.Sequential(
+        self.color_head = torch.nn.Sequential(
             torch.nn.Linear(width + 3 * (1 + 2 * direction_frequencies), width // 2),
             torch.nn.ReLU(),
             torch.nn.Linear(width // 2, 3),
@@ -74,7 +74,7 @@ class MLPField(Field):
             layer.bias[:narrow] = 0
         widen([self.density_head], [smaller.density_head])
         widen([self.bottleneck], [smaller.bottleneck])
-        head, smaller_head = linear_layers(self.colour_head), linear_layers(smaller.colour_head)
+        head, smaller_head = linear_layers(self.color_head), linear_layers(smaller.color_head)
         directions = torch.arange(self.bottleneck.out_features, head[0].in_features)
         widen(head, smaller_head, torch.cat([torch.arange(narrow), directions]))
 
@@ -85,6 +85,6 @@ class MLPField(Field):
             h = torch.relu(layer(torch.cat([h, x], dim=1) if index == self.skip else h))
         return self.activation(self.density_head(h).squeeze(1)), h
 
-    def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def color(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         inputs = torch.cat([self.bottleneck(features), sinusoidal(directions, self.direction_frequencies)], dim=1)
-        return torch.sigmoid(self.colour_head(inputs))
+        return torch.sigmoid(self.color_head(inputs))

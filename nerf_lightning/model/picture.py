@@ -49,7 +49,7 @@ class PictureMLP(PictureField):
             widen(linear_layers(self.net), linear_layers(smaller.net))
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        positions = 0.5 + 0.5 * self.centred(uv)  # square pixels: one set of octaves for both axes
+        positions = 0.5 + 0.5 * self.centered(uv)  # square pixels: one set of octaves for both axes
         return torch.sigmoid(self.net(sinusoidal(positions, self.num_frequencies)))
 
 
@@ -81,7 +81,7 @@ class FourierField(PictureField):
         self.net = build_relu_mlp([2 * num_frequencies, *[width] * depth, 3])
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        angles = math.pi * self.centred(uv) @ self.cycles  # the longer side is 2 units long
+        angles = math.pi * self.centered(uv) @ self.cycles  # the longer side is 2 units long
         return torch.sigmoid(self.net(torch.cat([angles.sin(), angles.cos()], dim=1)))
 
 
@@ -123,7 +123,7 @@ class SirenField(PictureField):
             layer.weight.uniform_(-bound, bound)
 
     def forward(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        h = self.centred(uv)
+        h = self.centered(uv)
         for index, layer in enumerate(self.hidden):
             h = torch.sin((self.first_frequency if index == 0 else self.HIDDEN_FREQUENCY) * layer(h))
         return 0.5 + 0.5 * self.last(h)  # the paper's outputs lie around 0; display clips to [0, 1]

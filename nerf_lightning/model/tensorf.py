@@ -98,21 +98,21 @@ class VectorMatrix(torch.nn.Module):
 
 
 class TensoRFField(Field):
-    """TensoRF: density as a sum of planes times lines; colour from a small network of such products and the direction.
+    """TensoRF: density as a sum of planes times lines; color from a small network of such products and the direction.
 
     Planes are upsampled during training: a coarse grid finds the shape sooner. The network's first layer includes the
     paper's basis matrix.
 
     Args:
         bounds: the box the planes cover.
-        density_components, colour_components: channels of each plane; multiples of 8 are fastest on a CPU.
+        density_components, color_components: channels of each plane; multiples of 8 are fastest on a CPU.
         base_resolution, max_resolution: initial and final cells along a side. None: 160, more for larger photos, see
             `Bounds.resolution_scale`.
         stages: number of resolutions, growing geometrically.
         growth_end: training progress at which the final resolution is reached; earlier stages have equal lengths, within
             `MIN_STEPS_PER_STAGE` and `MAX_STEPS_PER_STAGE`.
         width: neurons of the hidden layer. None: 32, up to 64 where larger photos make planes finer.
-        degree: degree of the spherical harmonics of the direction, 0 to 3; 0 makes colours view-independent. With few
+        degree: degree of the spherical harmonics of the direction, 0 to 3; 0 makes colors view-independent. With few
             photos, less than 3 may be better.
         density: "relu", "softplus" or "exp".
         size: "auto" limits both resolutions to what the photos resolve; "fixed" does not.
@@ -127,7 +127,7 @@ class TensoRFField(Field):
         self,
         bounds: Bounds,
         density_components: Count = 16,
-        colour_components: Count = 16,
+        color_components: Count = 16,
         base_resolution: GridSize = 64,
         max_resolution: GridSize | None = None,
         stages: Layers = 4,
@@ -154,50 +154,50 @@ class TensoRFField(Field):
             steps = MIN_STEPS_PER_STAGE * (stages - 1), MAX_STEPS_PER_STAGE * (stages - 1)
             self.growth = ResolutionSchedule(self.resolutions, starts, *steps)
         self.density_volume = VectorMatrix(base_resolution, density_components)
-        self.colour_volume = VectorMatrix(base_resolution, colour_components)
+        self.color_volume = VectorMatrix(base_resolution, color_components)
         self.activation = density_activation(density)
         self.terms = num_sh_bases(degree)
-        self.colour_net = build_layers(3 * colour_components + self.terms, width, 3)
+        self.color_net = build_layers(3 * color_components + self.terms, width, 3)
 
     @property
     def resolution_scale(self) -> float:
         return max(1.0, self.density_volume.cells / DEFAULT_MAX_RESOLUTION) if self.has_auto_resolution else 1.0
 
     def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        density, colour = self.density_volume, self.colour_volume
-        factors = (density.planes, density.lines), (colour.planes, colour.lines)
+        density, color = self.density_volume, self.color_volume
+        factors = (density.planes, density.lines), (color.planes, color.lines)
         total, products = plane_line_sum_and_products(*factors, self.bounds.to_unit(positions))
         return self.activation(total), products
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """Density of `forward`, without computing the colour."""
+        """Density of `forward`, without computing the color."""
         return self.activation(self.density_volume.sum_components(self.bounds.to_unit(positions))) / self.unit_length
 
-    def colour(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+    def color(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         basis = encode_directions(directions, self.terms)
-        return torch.sigmoid(mlp(features, layer_parameters(self.colour_net), basis))
+        return torch.sigmoid(mlp(features, layer_parameters(self.color_net), basis))
 
     def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
         self.density_volume.prune(visible_cells)
-        self.colour_volume.prune(visible_cells)
+        self.color_volume.prune(visible_cells)
 
     @torch.no_grad()
     def warm_start_from(self, smaller: Field) -> None:
         """Copies all parameters and upsamples to the final resolution at once: coarse stages are already trained."""
         assert isinstance(smaller, TensoRFField)
-        # Density is a plain sum; new colour components have no effect while their network weights are zero.
+        # Density is a plain sum; new color components have no effect while their network weights are zero.
         self.density_volume.warm_start_from(smaller.density_volume, zero_init=True)
-        self.colour_volume.warm_start_from(smaller.colour_volume, zero_init=False)
-        for volume in (self.density_volume, self.colour_volume):
+        self.color_volume.warm_start_from(smaller.color_volume, zero_init=False)
+        for volume in (self.density_volume, self.color_volume):
             if volume.cells < self.resolutions[-1]:
                 volume.resize(self.resolutions[-1])
-        width, smaller_width = (volume.lines.shape[2] for volume in (self.colour_volume, smaller.colour_volume))
+        width, smaller_width = (volume.lines.shape[2] for volume in (self.color_volume, smaller.color_volume))
         products = [mode * width + component for mode in range(3) for component in range(smaller_width)]
         columns = torch.tensor([*products, *range(3 * width, 3 * width + smaller.terms)])
-        widen(linear_layers(self.colour_net), linear_layers(smaller.colour_net), columns)
+        widen(linear_layers(self.color_net), linear_layers(smaller.color_net), columns)
 
     def max_num_parameters(self) -> int:
-        components = self.density_volume.lines.shape[2] + self.colour_volume.lines.shape[2]
+        components = self.density_volume.lines.shape[2] + self.color_volume.lines.shape[2]
         now, last = self.density_volume.cells + 1, self.resolutions[-1] + 1
         return super().max_num_parameters() + 3 * components * (last * last + last - now * now - now)
 
@@ -206,6 +206,6 @@ class TensoRFField(Field):
         return max(sum(cells <= self.density_volume.cells for cells in self.resolutions) - 1, 0)
 
     def upsample(self, stage: int) -> list[torch.nn.Parameter]:
-        for volume in (self.density_volume, self.colour_volume):
+        for volume in (self.density_volume, self.color_volume):
             volume.resize(self.resolutions[stage])
-        return [*self.density_volume.parameters(), *self.colour_volume.parameters()]
+        return [*self.density_volume.parameters(), *self.color_volume.parameters()]

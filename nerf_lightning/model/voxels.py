@@ -1,4 +1,4 @@
-"""Sparse voxel grid of densities and spherical-harmonics colours, without a network (Plenoxels, Fridovich-Keil et al. 2022)."""
+"""Sparse voxel grid of densities and spherical-harmonics colors, without a network (Plenoxels, Fridovich-Keil et al. 2022)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -31,7 +31,7 @@ VISIBILITY_WINDOW = 0.5
 """Fraction at the end of a stage; vertices read in it survive pruning."""
 TV_SLICES = 4
 """Number of slices of the table; each step computes the total variation of one."""
-TABLE_NAMES = ("log_density", "colours", "sh_coefficients")
+TABLE_NAMES = ("log_density", "colors", "sh_coefficients")
 VERTICES_PER_CHUNK = 1 << 16
 """Vertices interpolated at a time when upsampling, to bound the memory."""
 BYTES_PER_VERTEX = 14
@@ -39,11 +39,11 @@ BYTES_PER_VERTEX = 14
 
 
 class VoxelField(Field):
-    """Vertices of a sparse cubic grid, each with log-density, colour and spherical-harmonics coefficients.
+    """Vertices of a sparse cubic grid, each with log-density, color and spherical-harmonics coefficients.
 
-    All are interpolated trilinearly before the density's exponential and the colour's sigmoid, which keeps surfaces sharp
+    All are interpolated trilinearly before the density's exponential and the color's sigmoid, which keeps surfaces sharp
     (DVGO, Sun et al. 2022, section 4). Training starts on a coarse, full grid that is upsampled in stages. Each stage keeps
-    only the neighbourhood of vertices read in the second half of the previous stage: samplers return only visible samples,
+    only the neighborhood of vertices read in the second half of the previous stage: samplers return only visible samples,
     so this prunes by visibility. Row 0 is the shared constant for pruned vertices.
 
     Args:
@@ -51,8 +51,8 @@ class VoxelField(Field):
         base_resolution, max_resolution: initial and final cells along a side.
         stages: number of resolutions, growing geometrically.
         growth_end: training progress at which the final resolution is reached.
-        degree: degree of the spherical harmonics, 0 to 3; 0 makes colours view-independent.
-        density_lr_scale: factor on the learning rate of the log-densities, relative to the colours'.
+        degree: degree of the spherical harmonics, 0 to 3; 0 makes colors view-independent.
+        density_lr_scale: factor on the learning rate of the log-densities, relative to the colors'.
         tv_weight: weight of the total variation of the log-densities (Plenoxels, eq. 3, without the root).
         size: "auto" limits both resolutions to what the photos resolve; "fixed" does not.
 
@@ -97,14 +97,14 @@ class VoxelField(Field):
         vertices = (self.growth.resolutions[0] + 1) ** 3
         self.log_density = torch.nn.Parameter(torch.zeros(1 + vertices))  # divided by density_lr_scale
         self.log_density.data[0] = EMPTY_LOG_DENSITY / density_lr_scale
-        self.colours = torch.nn.Parameter(torch.zeros(1 + vertices, 3))
+        self.colors = torch.nn.Parameter(torch.zeros(1 + vertices, 3))
         self.sh_coefficients = torch.nn.Parameter(torch.zeros(1 + vertices, 3 * self.terms))
         self.set_vertices(torch.ones(vertices, dtype=torch.bool), [table.data for table in self.tables])
 
     @property
     def tables(self) -> tuple[torch.nn.Parameter, torch.nn.Parameter, torch.nn.Parameter]:
         """Parameter tables, one row per vertex."""
-        return self.log_density, self.colours, self.sh_coefficients
+        return self.log_density, self.colors, self.sh_coefficients
 
     @property
     def training_bytes(self) -> int:
@@ -131,7 +131,7 @@ class VoxelField(Field):
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
         rows, weights = locate_vertices(self.index, self.bounds.to_unit(positions))
         basis = encode_directions(directions, 1 + self.terms)[:, 1:]
-        raw, rgb = interpolate_voxels(self.log_density, self.colours, self.sh_coefficients, rows, weights, basis)
+        raw, rgb = interpolate_voxels(self.log_density, self.colors, self.sh_coefficients, rows, weights, basis)
         if torch.is_grad_enabled():
             self.mark_read(rows)
         return FieldOutput(self.density_from_raw(raw), torch.sigmoid(rgb))
@@ -182,7 +182,7 @@ class VoxelField(Field):
         padded = coefficients.new_zeros(len(coefficients), 3, self.terms)
         padded[..., : coefficients.shape[2]] = coefficients
         density = smaller.log_density * (smaller.density_lr_scale / self.density_lr_scale)
-        self.set_vertices(smaller.occupied, [density, smaller.colours.detach(), padded.flatten(1)])
+        self.set_vertices(smaller.occupied, [density, smaller.colors.detach(), padded.flatten(1)])
 
     @torch.no_grad()
     def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:

@@ -15,12 +15,12 @@ GAMMA = 2.2
 
 
 class ColorCorrection(torch.nn.Module):
-    """Colour gains of V photos, initially 1.
+    """Color gains of V photos, initially 1.
 
     Args:
         cameras: of the photos, as given.
         exposures: exposure of each photo from its metadata, in any unit; empty if unknown.
-        affine: also learns a 3x4 colour matrix of each photo.
+        affine: also learns a 3x4 color matrix of each photo.
         vignetting: also learns darker corners, the same in all photos.
         fix_mean: keeps the mean gain at 1, so that the scene does not brighten.
 
@@ -94,13 +94,13 @@ class ColorCorrection(torch.nn.Module):
         views: Int[Tensor, "R"],
         truth: Float[Tensor, "R 3"] | None = None,
     ) -> Float[Tensor, "R 3"]:
-        """Corrects rendered foreground colours to look as in their photos; the background stays.
+        """Corrects rendered foreground colors to look as in their photos; the background stays.
 
-        Where `truth` is saturated (1), brighter colours are clamped to it.
+        Where `truth` is saturated (1), brighter colors are clamped to it.
 
         Args:
             rgb, opacity: rendered.
-            backgrounds: colours behind.
+            backgrounds: colors behind.
             rays: of the pixels, from the cameras as given.
             views: photo of each ray.
             truth: the photos' pixels.

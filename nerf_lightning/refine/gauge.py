@@ -5,7 +5,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 DISTANCE_DAMPING = 1e-3
-"""Fraction of the mean squared distance that is added to each, for cameras at the centre of the content."""
+"""Fraction of the mean squared distance that is added to each, for cameras at the center of the content."""
 RANK_TOLERANCE = 1e-6
 """Relative singular value below which a direction counts as linearly dependent."""
 TAYLOR_MAX_ANGLE_SQUARED = 1e-6
@@ -29,20 +29,20 @@ def rotate_axis_angle(vectors: Float[Tensor, "R 3"], rotations: Float[Tensor, "R
 
 
 def compute_projection_jacobian(
-    centres: Float[Tensor, "V 3"], focals: Float[Tensor, "V"], points: Float[Tensor, "P 3"]
+    centers: Float[Tensor, "V 3"], focals: Float[Tensor, "V"], points: Float[Tensor, "P 3"]
 ) -> Float[Tensor, "V P 3 6"]:
     """Jacobian of the points' projections in the rotation and translation of each camera.
 
     Args:
-        centres: of the cameras, world frame.
+        centers: of the cameras, world frame.
         focals: in pixels.
         points: world frame.
 
     Returns:
-        Derivatives of the direction from the camera, in pixels at the image centre, along world axes. Columns 0 to 2: rotation
-        about the camera centre (world axes, radians); 3 to 5: its translation (world units).
+        Derivatives of the direction from the camera, in pixels at the image center, along world axes. Columns 0 to 2: rotation
+        about the camera center (world axes, radians); 3 to 5: its translation (world units).
     """
-    offsets = points - centres[:, None]
+    offsets = points - centers[:, None]
     distance = offsets.norm(dim=2)[..., None, None]
     ray = offsets[..., None] / distance
     axes = torch.eye(3, dtype=ray.dtype, device=ray.device).expand(*ray.shape[:2], 3, 3)
@@ -51,21 +51,21 @@ def compute_projection_jacobian(
     return focals[:, None, None, None] * (axes - ray * ray.mT) @ torch.cat([rotation, -axes], dim=3) / distance
 
 
-def compute_gauge_modes(centres: Float[Tensor, "V 3"], content_centre: Float[Tensor, "3"]) -> Float[Tensor, "V 6 10"]:
+def compute_gauge_modes(centers: Float[Tensor, "V 3"], content_center: Float[Tensor, "3"]) -> Float[Tensor, "V 6 10"]:
     """Gauge modes: joint camera motions that photos cannot, or hardly, constrain.
 
     The 7-DoF similarity, and translations of the content, which distant cameras absorb by rotating.
 
     Args:
-        centres: of the cameras, world frame.
-        content_centre: world frame.
+        centers: of the cameras, world frame.
+        content_center: world frame.
 
     Returns:
         Rotation and translation of each camera as in `compute_projection_jacobian`. Columns: translation (3), rotation (3) and
         scale (1) of everything, translation of the content (3).
     """
-    axes = torch.eye(3, dtype=centres.dtype, device=centres.device).expand(len(centres), 3, 3)
-    zeros, offsets = torch.zeros_like(axes), (centres - content_centre)[:, :, None]
+    axes = torch.eye(3, dtype=centers.dtype, device=centers.device).expand(len(centers), 3, 3)
+    zeros, offsets = torch.zeros_like(axes), (centers - content_center)[:, :, None]
     square = offsets.square().sum(1, keepdim=True)
     square = (square + DISTANCE_DAMPING * square.mean()).clamp_min(torch.finfo(square.dtype).tiny)
     perpendicular = torch.linalg.cross(axes, offsets.expand_as(axes), dim=1)

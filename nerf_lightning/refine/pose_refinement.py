@@ -47,13 +47,13 @@ class PoseRefinement(torch.nn.Module):
         if focal and cameras.lenses is not None and bool((cameras.lenses.projection != Projection.PERSPECTIVE).any()):
             found = "true, with fisheye or equirectangular photos"
             raise InputError("refine.focal", "", found, "false for these")
-        centres, content_centre = cameras.centres.cpu().double(), bounds.centre.cpu().double()
+        centers, content_center = cameras.centers.cpu().double(), bounds.center.cpu().double()
         corners = torch.rand(NUM_POINTS, 3, dtype=torch.float64, generator=step_generator(0, Stream.ANALYSIS, 0))
-        points = content_centre + bounds.half_size.cpu().double() * (2 * corners - 1)
+        points = content_center + bounds.half_size.cpu().double() * (2 * corners - 1)
         preconditioner = compute_preconditioner(
-            compute_projection_jacobian(centres, cameras.K[:, 0, 0].cpu().double(), points), PRECONDITIONER_DAMPING
+            compute_projection_jacobian(centers, cameras.K[:, 0, 0].cpu().double(), points), PRECONDITIONER_DAMPING
         )
-        gauge = torch.linalg.solve(preconditioner, compute_gauge_modes(centres, content_centre))
+        gauge = torch.linalg.solve(preconditioner, compute_gauge_modes(centers, content_center))
         self.register_buffer("preconditioner", preconditioner.float())
         self.register_buffer("gauge", orthonormal_basis(gauge.flatten(0, 1)).float(), persistent=False)
         self.register_buffer("optical_axes", cameras.c2w[:, :3, 2].clone(), persistent=False)

@@ -28,7 +28,7 @@ def parse_style(system: NeRF3D, path: CameraPath, channels: str, background: str
     """Parses the options `channels` and `background`.
 
     Raises:
-        InputError: an unknown or repeated channel, an invalid colour, or a background that the photos do not have.
+        InputError: an unknown or repeated channel, an invalid color, or a background that the photos do not have.
     """
     names = tuple(name.strip() for name in channels.split(","))
     if any(name not in CHANNELS for name in names) or len(set(names)) < len(names):
@@ -45,7 +45,7 @@ def parse_style(system: NeRF3D, path: CameraPath, channels: str, background: str
             raise InputError("render", "background", repr(background), expected)
     if path.photos is not None:
         if background == "transparent":
-            raise InputError("render", "background", background, "a colour, for a path along photos")
+            raise InputError("render", "background", background, "a color, for a path along photos")
         if path.photos.channels == 3 and not np.allclose((red, green, blue), scene_color, atol=1e-3):
             expected = (
                 f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in scene_color]}"

@@ -43,10 +43,10 @@ def read_path(file: Path, orbit: Cameras, to_source: Float[Tensor, "4 4"], frame
     plain = read_json(file, "a camera path in JSON")
     try:
         if "camera_path" in plain:
-            plain, kind, native = _nerfstudio(plain), "nerfstudio's path", "file"
+            plain, kind, native = _parse_nerfstudio(plain), "nerfstudio's path", "file"
         elif "path" in plain:
             kind, native = "instant-ngp's path, of scale 0.33 and offset 0.5", "file"
-            plain = _instant_ngp(plain, *orbit.size(0))
+            plain = _parse_instant_ngp(plain, *orbit.size(0))
         else:
             kind, native = "a path", "run"
         cameras = parse_cameras(file, "", plain)
@@ -64,22 +64,22 @@ def read_path(file: Path, orbit: Cameras, to_source: Float[Tensor, "4 4"], frame
     return replace(cameras, c2w=in_run.to(cameras.c2w))
 
 
-def _nerfstudio(plain: dict[str, Any]) -> dict[str, Any]:
+def _parse_nerfstudio(plain: dict[str, Any]) -> dict[str, Any]:
     views, size = plain["camera_path"], (int(plain["render_width"]), int(plain["render_height"]))
     poses = np.array([view["camera_to_world"] for view in views], np.float64).reshape(-1, 4, 4)
-    return _with_fov(views, opengl_to_opencv(poses), *size)
+    return _make_cameras_from_fov(views, opengl_to_opencv(poses), *size)
 
 
-def _instant_ngp(plain: dict[str, Any], width: int, height: int) -> dict[str, Any]:
+def _parse_instant_ngp(plain: dict[str, Any], width: int, height: int) -> dict[str, Any]:
     """Its cameras are OpenCV cameras, as ours."""
     poses = np.tile(np.eye(4), (len(plain["path"]), 1, 1))
     for pose, view in zip(poses, plain["path"], strict=True):
         pose[:3, :3] = Rotation.from_quat(np.array(view["R"], np.float64)).as_matrix()
         pose[:3, 3] = (np.array(view["T"], np.float64) - NGP_OFFSET) / NGP_SCALE
-    return _with_fov(plain["path"], NGP_AXES @ poses, width, height)
+    return _make_cameras_from_fov(plain["path"], NGP_AXES @ poses, width, height)
 
 
-def _with_fov(views: list[dict[str, Any]], c2w: Any, width: int, height: int) -> dict[str, Any]:
+def _make_cameras_from_fov(views: list[dict[str, Any]], c2w: Any, width: int, height: int) -> dict[str, Any]:
     """Cameras as plain values, from vertical fields of view in degrees."""
     focal = [height / (2 * math.tan(math.radians(float(view["fov"])) / 2)) for view in views]
     K = [[[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]] for f in focal]

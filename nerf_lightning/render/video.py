@@ -36,7 +36,7 @@ def check_output(output: Path, transparent: bool) -> None:
         expected = f"a name ending in {', '.join(SUFFIXES)}, or a folder of PNGs"
         raise InputError("render", "output", output.name, expected)
     if transparent and output.suffix in OPAQUE_SUFFIXES:
-        raise InputError("render", "background", f"transparent for {output.suffix}", "a colour", "or -o FILE.webp")
+        raise InputError("render", "background", f"transparent for {output.suffix}", "a color", "or -o FILE.webp")
     if output.suffix == ".mp4":
         require_extra("video", "av", purpose="the optional extra that writes .mp4", hint=", or -o FILE.webp")
 

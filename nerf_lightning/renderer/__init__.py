@@ -1,4 +1,4 @@
-"""Stage 5, renderer: Samples with density and rgb -> colour, opacity, depth."""
+"""Stage 5, renderer: Samples with density and rgb -> color, opacity, depth."""
 
 from nerf_lightning.renderer.background import Background
 from nerf_lightning.renderer.renderer import FieldFn, RenderOutput, VolumeRenderer, composite_over

@@ -1,4 +1,4 @@
-"""Regularization losses on rendering weights: distortion, density near cameras, view-dependent colour."""
+"""Regularization losses on rendering weights: distortion, density near cameras, view-dependent color."""
 
 import torch
 from jaxtyping import Float
@@ -63,7 +63,7 @@ def view_loss(
     """View loss, mean over rays of sum_i w_i (|v_i|^2 + 10 p |v_i|) with view residual v.
 
     Unconstrained view dependence can explain every photo with wrong geometry (shape-radiance ambiguity). This regularizer
-    keeps colour view-independent unless a highlight explains many pixels; where photos are textureless even a small residual
+    keeps color view-independent unless a highlight explains many pixels; where photos are textureless even a small residual
     can move a surface, and the L1 term keeps it at zero.
 
     Args:

@@ -26,7 +26,7 @@ class RenderOutput:
     """Rendered rays."""
 
     rgb: Float[Tensor, "R 3"]
-    """Colour composited onto the background."""
+    """Color composited onto the background."""
     opacity: Float[Tensor, "R"]
     """Accumulated opacity in [0, 1]."""
     distance: Float[Tensor, "R"]
@@ -44,10 +44,10 @@ class RenderOutput:
 
 def composite_over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
     """Composites photo pixels with straight alpha (C = 4) onto backgrounds; returns RGB in [0, 1]."""
-    colours = (pixels / 255).to(backgrounds.dtype)
-    if colours.shape[1] == 3:
-        return colours
-    return torch.lerp(backgrounds, colours[:, :3], colours[:, 3:])
+    colors = (pixels / 255).to(backgrounds.dtype)
+    if colors.shape[1] == 3:
+        return colors
+    return torch.lerp(backgrounds, colors[:, :3], colors[:, 3:])
 
 
 def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], samples: Samples) -> Float[Tensor, "R"]:
@@ -72,12 +72,12 @@ class VolumeRenderer(torch.nn.Module):
     """Volume rendering (NeRF, Mildenhall et al. 2020, eq. 3) over a background, and losses on the rendering weights.
 
     Args:
-        background: "scene" (the scene's colour), "black", "white", "random" (random per training ray, "scene" in evaluation;
+        background: "scene" (the scene's color), "black", "white", "random" (random per training ray, "scene" in evaluation;
             needs images with alpha), "auto" ("random" with alpha, else "scene"), or three numbers in [0, 1].
-        scene_background: the colour of "scene".
+        scene_background: the color of "scene".
         distortion_loss_weight: weight of `distortion_loss`, against fog.
         near_loss_weight: initial weight of `near_loss`, against density near the cameras; it fades out.
-        view_loss_weight: weight of `view_loss`, on view-dependent colour; "auto": `AUTO_VIEW_LOSS_WEIGHT`.
+        view_loss_weight: weight of `view_loss`, on view-dependent color; "auto": `AUTO_VIEW_LOSS_WEIGHT`.
         half_size: half-size of the scene's box, world units.
         unbounded: see `Bounds`.
         alpha: whether the photos have alpha.
@@ -123,12 +123,12 @@ class VolumeRenderer(torch.nn.Module):
         if self.unbounded and not has_gradient:
             # Median for unbounded scenes: 1 % of stray weight at the far plane would dominate the mean.
             distance = opacity * median_depth(density, opacity, samples)
-        colour = torch.addcmul(foreground, (1 - opacity)[:, None], backgrounds)
+        color = torch.addcmul(foreground, (1 - opacity)[:, None], backgrounds)
         has_losses = self.distortion_loss_weight or self.near_loss_weight or self.view_loss_weight
         if not (self.training and has_gradient and (has_losses or samples.proposals is not None)):
-            return RenderOutput(colour, opacity, distance)  # a full view has too many samples to keep
+            return RenderOutput(color, opacity, distance)  # a full view has too many samples to keep
         weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-        return RenderOutput(colour, opacity, distance, weights, view_residual)
+        return RenderOutput(color, opacity, distance, weights, view_residual)
 
     def losses(
         self,

@@ -33,7 +33,7 @@ MAX_HEADER_BYTES = 16 << 20
 Arrays = dict[str, Any]  # of numpy arrays
 
 
-def encode(system: System, precision: str, config: dict[str, Any], scene: dict[str, Any]) -> bytes:
+def encode_system(system: System, precision: str, config: dict[str, Any], scene: dict[str, Any]) -> bytes:
     """Encodes a system as the content of a compact file.
 
     Args:
@@ -91,7 +91,7 @@ def _dequantize(name: str, arrays: Arrays, code: str, shape: list[int]) -> Tenso
     return torch.from_numpy(array.reshape(shape).copy())
 
 
-def decode(content: bytes, path: Path | str, device: torch.device = CPU) -> LoadedRun:
+def decode_run(content: bytes, path: Path | str, device: torch.device = CPU) -> LoadedRun:
     """Decodes a compact file into a system ready to render.
 
     Args:
@@ -158,6 +158,6 @@ def _pack(header: dict[str, Any], arrays: Arrays) -> bytes:
 
 
 def load_compact(path: Path, device: torch.device = CPU) -> LoadedRun:
-    """Reads a compact file, ready to render on a device; raises as `decode`, and for a missing file."""
+    """Reads a compact file, ready to render on a device; raises as `decode_run`, and for a missing file."""
     require_file(path, "a compact file", "nerf_lightning export compact makes one")
-    return decode(read_file(path), path, device)
+    return decode_run(read_file(path), path, device)

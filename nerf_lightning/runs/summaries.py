@@ -38,7 +38,7 @@ class RunSummary:
     def get_metric(self, key: str) -> float | None:
         """A finite number from the results, or None."""
         value = self.results.get(key)
-        return float(value) if _finite(value) else None
+        return float(value) if _is_finite(value) else None
 
     @property
     def psnr(self) -> float | None:
@@ -53,10 +53,10 @@ class RunSummary:
         """(training seconds, step, PSNR) of each finite point."""
         points = self.results.get("curve")
         triples = [p for p in points if isinstance(p, list) and len(p) == 3] if isinstance(points, list) else []
-        return [(p[0], p[1], p[2]) for p in triples if all(map(_finite, p))]
+        return [(p[0], p[1], p[2]) for p in triples if all(map(_is_finite, p))]
 
 
-def _finite(value: Any) -> TypeGuard[float]:
+def _is_finite(value: Any) -> TypeGuard[float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

@@ -75,19 +75,19 @@ class OccupancyGrid(BoundedModule):
 
     @torch.no_grad()
     def mark_invisible_cells(self, cameras: Cameras, min_cameras: int) -> None:
-        """Permanently empties cells whose centre is in view of fewer than `min_cameras` cameras."""
+        """Permanently empties cells whose center is in view of fewer than `min_cameras` cameras."""
         camera_indices = torch.linspace(0, len(cameras) - 1, min(len(cameras), MAX_CAMERAS)).round().long()
         n = self.resolution
         cells = torch.arange(n**3)
         unit = (torch.stack([cells // (n * n), cells // n % n, cells % n], dim=1) + 0.5) / n
         bounds = self.bounds.to("cpu")
-        centres, near = bounds.to_world(unit), self.bounds.near or 0.0
+        centers, near = bounds.to_world(unit), self.bounds.near or 0.0
         count = torch.zeros(len(cells), dtype=torch.int32)
         required = min(min_cameras, len(camera_indices))
         for camera in camera_indices:
             candidates = (count < required).nonzero()[:, 0]  # skip cells that already have enough views
-            points, view = centres[candidates], cameras[camera : camera + 1].to("cpu")
-            count[candidates] += (view.project(points, 0)[2] & ((points - view.centres).norm(dim=1) > near)).int()
+            points, view = centers[candidates], cameras[camera : camera + 1].to("cpu")
+            count[candidates] += (view.project(points, 0)[2] & ((points - view.centers).norm(dim=1) > near)).int()
         in_view = count >= required
         self.in_view.copy_(in_view if in_view.any() else torch.ones_like(in_view))
         self.occupied &= self.in_view

@@ -20,7 +20,7 @@ CHUNK = 1 << 15
 SAMPLES_PER_RAY = 8
 """Typical number of samples per ray, which determines the ray chunk size."""
 MIN_SAMPLE_WEIGHT = 0.01
-"""Weight below which evaluation merges a sample with its neighbour: a quarter of Lego's at 800 pixels, for 0.001 dB."""
+"""Weight below which evaluation merges a sample with its neighbor: a quarter of Lego's at 800 pixels, for 0.001 dB."""
 
 
 class Histogram(NamedTuple):
@@ -83,12 +83,12 @@ class Samples:
         return self._take(keep, self.ray[keep], offsets)
 
     def _take(self, index: Tensor | slice, ray: Int[Tensor, "M"], offsets: Int[Tensor, "Q"]) -> "Samples":
-        """Selects evaluation samples; `ray` and `offsets` belong to the selection."""
-        optical_depth = None if self.optical_depth is None else self.optical_depth[index]
-        return Samples(self.t[index], self.dt[index], ray, offsets, optical_depth=optical_depth)
+        """Selects evaluation samples (without proposals); `ray` and `offsets` belong to the selection."""
+        positions, optical_depth = (None if x is None else x[index] for x in (self.cached_positions, self.optical_depth))
+        return Samples(self.t[index], self.dt[index], ray, offsets, None, positions, optical_depth)
 
     def merge_low_weight_samples(self) -> "Samples":
-        """Merges neighbouring samples if one has less than `MIN_SAMPLE_WEIGHT`; no-op if the optical depth is unknown."""
+        """Merges neighboring samples if one has less than `MIN_SAMPLE_WEIGHT`; no-op if the optical depth is unknown."""
         if self.optical_depth is None:
             return self
         packed = self.t, self.dt, self.ray, self.offsets
@@ -143,7 +143,7 @@ class Sampler(BoundedModule):
         return max(1, self.chunk // SAMPLES_PER_RAY)
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Named parameter groups of the optimiser for the sampler's parameters."""
+        """Named parameter groups of the optimizer for the sampler's parameters."""
         return []
 
     def lr_factors(self, progress: float) -> dict[str, float]:

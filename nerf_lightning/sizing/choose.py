@@ -99,7 +99,7 @@ def choose_candidate(rungs: Sequence[RungResult], target: Target) -> int:
     return next((rung for rung, result in enumerate(rungs) if result.psnr >= threshold), best)
 
 
-def choose_neighbour(first: int, psnr: float, rungs: Sequence[RungResult], target: Target, last: int) -> int | None:
+def choose_neighbor(first: int, psnr: float, rungs: Sequence[RungResult], target: Target, last: int) -> int | None:
     """The second rung to train in full, to confirm the choice; None if it is already certain.
 
     Args:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
 from nerf_lightning.drawing.panels import write_png
-from nerf_lightning.drawing.style import BLUE, DPI, GREY, ORANGE, VERMILLION, rasterize_figure
+from nerf_lightning.drawing.style import BLUE, DPI, GRAY, ORANGE, VERMILLION, rasterize_figure
 from nerf_lightning.runs.folder import config_to_dict
 from nerf_lightning.sizing.search import format_figures, set_options
 from nerf_lightning.utils.files import atomic_write, write_json
@@ -78,12 +78,12 @@ def draw_chart(result: dict[str, Any]) -> Figure:
         sizes, figures = [entry["size"] / 1000 for entry in rungs], [entry["psnr"] for entry in rungs]
         axes.plot(sizes, figures, style, color=color, ms=8, mfc=fill, label=label)
     for rung, entry in enumerate(growing):
-        offset = (0, 8) if rung % 2 else (0, -16)  # neighbours may have equal sizes
+        offset = (0, 8) if rung % 2 else (0, -16)  # neighbors may have equal sizes
         point = entry["size"] / 1000, entry["psnr"]
         axes.annotate(str(rung), point, offset, textcoords="offset points", ha="center")
     point = chosen["size"] / 1000, chosen["psnr"]
     axes.plot(*point, "o", ms=19, mfc="none", mec=VERMILLION, mew=2, label=f"chosen: rung {result['rung']}")
-    axes.axhline(threshold, color=GREY, lw=1, ls="--", label=f"enough: {threshold:.2f} dB")
+    axes.axhline(threshold, color=GRAY, lw=1, ls="--", label=f"enough: {threshold:.2f} dB")
     axes.set(xscale="log", xlabel="compact file, kB", ylabel="held-out PSNR, dB", title="Quality by size")
     axes.xaxis.set_major_formatter("{x:g}")
     axes.margins(0.08, 0.12)

@@ -1,4 +1,4 @@
-"""Size search: one growing training climbs the ladder; the candidate rung and a neighbour are trained in full."""
+"""Size search: one growing training climbs the ladder; the candidate rung and a neighbor are trained in full."""
 
 import copy
 import inspect
@@ -25,7 +25,7 @@ from nerf_lightning.export.compress import (
     subsample_cameras,
 )
 from nerf_lightning.model import is_at_least_as_wide
-from nerf_lightning.runs.compact import encode
+from nerf_lightning.runs.compact import encode_system
 from nerf_lightning.runs.folder import config_to_dict, load_run
 from nerf_lightning.runs.run_lock import is_empty
 from nerf_lightning.runs.scene_file import scene_to_dict
@@ -37,7 +37,7 @@ from nerf_lightning.sizing.choose import (
     Target,
     choose_candidate,
     choose_final,
-    choose_neighbour,
+    choose_neighbor,
     is_growth_finished,
 )
 from nerf_lightning.system import System
@@ -79,13 +79,13 @@ def search_sizes(cfg: DictConfig, target: Target, ladder: Ladder, output: Path) 
         InputError: invalid device, data or ladder options; or the folder holds something else.
     """
     device, data = prepare_search(cfg, ladder, output)
-    start_or_resume(output, cfg, target, ladder)
+    write_or_check_plan(output, cfg, target, ladder)
     rungs, systems = climb_ladder(cfg, data, ladder.rungs, target, output)
     first = choose_candidate(rungs, target)
     print(f"climbed to rung {len(rungs) - 1}; training rung {first} in full", flush=True)
     sampler = find_sampler(set_options(cfg, "model", ladder.rungs[first]), data, systems[first], ladder.samplers)
     full = {first: train_full_run(cfg, ladder.rungs[first], sampler, data, output / f"rung_{first}")}
-    second = choose_neighbour(first, full[first].psnr, rungs, target, len(ladder.rungs) - 1)
+    second = choose_neighbor(first, full[first].psnr, rungs, target, len(ladder.rungs) - 1)
     if second is not None:
         full[second] = train_full_run(cfg, ladder.rungs[second], sampler, data, output / f"rung_{second}")
     choice, reached = choose_final(full, target)
@@ -120,7 +120,7 @@ def prepare_search(cfg: DictConfig, ladder: Ladder, output: Path) -> tuple[torch
     return device, data
 
 
-def start_or_resume(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None:
+def write_or_check_plan(output: Path, cfg: DictConfig, target: Target, ladder: Ladder) -> None:
     """Writes the search plan, unless the folder holds the same one.
 
     Raises:
@@ -221,7 +221,7 @@ def measure_psnr(system: System, data: DataModule) -> float:
 def estimate_compact_bytes(cfg: DictConfig, system: Any, data: DataModule) -> int:
     """Approximate size of a system's compact file, pruned by `NUM_VIEWS` views."""
     seen = find_seen_cells(system, subsample_cameras(data, NUM_VIEWS)) if data.is_posed else None
-    return len(encode(prune_to_cells(system, seen), "byte", config_to_dict(cfg), scene_to_dict(data)))
+    return len(encode_system(prune_to_cells(system, seen), "byte", config_to_dict(cfg), scene_to_dict(data)))
 
 
 def find_sampler(cfg: DictConfig, data: DataModule, system: System, samplers: Sequence[Options]) -> Options:

@@ -42,7 +42,7 @@ def make_closeup(seed: int) -> Scene:
 
 
 def make_waves(width: int = 48, height: int = 48) -> Picture:
-    """Colour waves whose wavelength decreases from left to right, to six pixels of the training image.
+    """Color waves whose wavelength decreases from left to right, to six pixels of the training image.
 
     That image has `width` by `height` pixels; the returned one `UPSCALE_FACTOR` times as many per side.
     """
@@ -68,9 +68,9 @@ SCENES: dict[str, Callable[[int], Scene | Picture]] = {
     "plain floor": lambda seed: make_room_scene(ROOMS["plain floor"], seed),
     "waves": lambda seed: make_waves(),
     "wide waves": lambda seed: make_waves(96, 16),
-    "one colour": lambda seed: make_uniform_image(),
+    "one color": lambda seed: make_uniform_image(),
 }
-IMAGE_SCENES = ("waves", "wide waves", "one colour")
+IMAGE_SCENES = ("waves", "wide waves", "one color")
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,13 @@ from matplotlib.patches import Rectangle
 
 from nerf_lightning.drawing.contact_sheet import make_contact_sheet
 from nerf_lightning.drawing.panels import write_png
-from nerf_lightning.drawing.style import BLUE, DPI, GREY, VERMILLION, rasterize_figure
+from nerf_lightning.drawing.style import BLUE, DPI, GRAY, VERMILLION, rasterize_figure
 from nerf_lightning.stability.conditions import CONDITIONS, METHODS, Condition
 from nerf_lightning.stability.trial import TrialResult, get_trial_folder
 from nerf_lightning.utils.files import write_json
 
 COLOR_RANGE_DB = Normalize(8.0, 40.0, clip=True)
-"""Range of the colour scale."""
+"""Range of the color scale."""
 MAX_WORST_IMAGES = 30
 CLEAN_CONDITIONS = ("clean", "2D: clean")
 MAX_RESCUE_LOSS_DB = 2.0
@@ -54,8 +54,8 @@ class Verdict:
         return parts
 
 
-def judge(results: Sequence[TrialResult]) -> list[Verdict]:
-    """Verdicts by condition and method, in the order of `CONDITIONS`."""
+def judge_trials(results: Sequence[TrialResult]) -> list[Verdict]:
+    """Judges trials: verdicts by condition and method, in the order of `CONDITIONS`."""
     verdicts = []
     for condition in CONDITIONS.values():
         for method in dict.fromkeys(result.method for result in results):
@@ -121,7 +121,7 @@ def compute_median_psnr(results: Sequence[TrialResult]) -> float | None:
 
 def write_report(results: Sequence[TrialResult], suite: str, root: Path) -> dict[str, Any]:
     """Writes all files into the suite's folder, prints a summary, and returns the content of stability.json."""
-    verdicts = judge(results)
+    verdicts = judge_trials(results)
     lines = summarize(verdicts, find_rescues(results))
     for name, is_2d in (("heatmap.png", False), ("heatmap_2d.png", True)):
         part = [verdict for verdict in verdicts if verdict.condition.is_2d == is_2d]
@@ -179,7 +179,7 @@ def draw_heatmap(verdicts: Sequence[Verdict], suite: str) -> Figure:
         verdict = cells.get((condition, method))
         shade = 0.0 if verdict is None or verdict.worst is None else float(COLOR_RANGE_DB(verdict.worst))
         color = "#eeeeee" if verdict is None else VERMILLION if verdict.failed else blues(shade) if shade else "#d8d8d8"
-        text_color = GREY if verdict is None else "white" if verdict.failed or shade > 0.6 else "black"
+        text_color = GRAY if verdict is None else "white" if verdict.failed or shade > 0.6 else "black"
         axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=color, edgecolor="white"))
         words = "–" if verdict is None else ", ".join(verdict.describe())
         axes.text(column, row, words, ha="center", va="center", fontsize=8.5, color=text_color)
@@ -190,7 +190,7 @@ def draw_heatmap(verdicts: Sequence[Verdict], suite: str) -> Figure:
     axes.tick_params(length=0)
     seeds = max(len(verdict.results) for verdict in verdicts)
     note = "" if len(cells) == len(conditions) * len(methods) else "; –: does not apply"
-    axes.set_xlabel(f"worst seed of {seeds}, held out; suite {suite}{note}", color=GREY, fontsize=9)
+    axes.set_xlabel(f"worst seed of {seeds}, held out; suite {suite}{note}", color=GRAY, fontsize=9)
     axes.spines[:].set_visible(False)
     return figure
 

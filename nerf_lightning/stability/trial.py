@@ -67,7 +67,7 @@ def run_trials(trials: Sequence[Trial], root: Path, workers: int) -> Generator[T
     # If this process is killed, idle workers end after a minute.
     pool = ProcessPoolExecutor(workers, timeout=60, env={"OMP_NUM_THREADS": "1"})
     try:
-        # Submits a few at a time instead of pool.map: loky's shutdown fails with queued or cancelled trials (joblib 1.6).
+        # Submits a few at a time instead of pool.map: loky's shutdown fails with queued or canceled trials (joblib 1.6).
         rest = iter(trials)
         running = deque(pool.submit(run_trial, trial, root) for trial in islice(rest, 2 * workers))
         while running:

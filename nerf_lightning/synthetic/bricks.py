@@ -41,7 +41,7 @@ def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_v
     contents = f"{train_views + val_views:,} pictures of {size:,}x{size:,} pixels"
     check_memory("bricks", "size, train_views, val_views", contents, 4.0 * size**2 * (train_views + val_views))
     aabb = torch.from_numpy(load_bulldozer().aabb).float()
-    centre = aabb.mean(0)
+    center = aabb.mean(0)
     orbit = make_circle_poses(torch.zeros(3), torch.tensor(UP), CAMERA_RADIUS, math.radians(30), orbit_views)
     return Scene(
         name="bricks",
@@ -49,7 +49,7 @@ def bricks(size: int = 200, train_views: int = 100, val_views: int = 10, orbit_v
         train=_render_views(_hemisphere_poses(torch.arange(1, train_views + 1)), size, "train"),
         val=_render_views(_hemisphere_poses(-torch.arange(1, val_views + 1)), size, "val"),
         orbit=make_pinhole_cameras(orbit, size, size, FIELD_OF_VIEW_RAD),
-        bounds=Bounds(centre + 1.02 * (aabb - centre)),
+        bounds=Bounds(center + 1.02 * (aabb - center)),
         background=(0.0, 0.0, 0.0),
     )
 

@@ -23,7 +23,7 @@ def map_poses(views: Views, change: PoseTransform) -> Views:
 
 
 def map_colors(views: Views, change: ColorTransform) -> Views:
-    """Applies a function to the colours, in [0, 1]; alpha stays."""
+    """Applies a function to the colors, in [0, 1]; alpha stays."""
     photos = views.images.float() / 255
     photos = torch.cat([change(photos[..., :3]), photos[..., 3:]], dim=-1)
     return Views.from_images((photos.clamp(0, 1) * 255).round().to(torch.uint8), views.cameras)
@@ -54,7 +54,7 @@ def add_pose_noise(scene: Scene, seed: int, degrees: float, shift_std: float = 0
 
     Args:
         degrees: standard deviation of the angles.
-        shift_std: standard deviation of the shifts, relative to the cameras' mean distance to the content's centre.
+        shift_std: standard deviation of the shifts, relative to the cameras' mean distance to the content's center.
     """
 
     def perturb(c2w: Float[Tensor, "V 4 4"]) -> Float[Tensor, "V 4 4"]:
@@ -63,7 +63,7 @@ def add_pose_noise(scene: Scene, seed: int, degrees: float, shift_std: float = 0
         cross = torch.zeros(len(c2w), 3, 3)
         cross[:, [2, 0, 1], [1, 2, 0]] = vectors
         c2w[:, :3, :3] = torch.linalg.matrix_exp(cross - cross.mT) @ c2w[:, :3, :3]
-        distance = float((c2w[:, :3, 3] - scene.bounds.centre).norm(dim=1).mean())
+        distance = float((c2w[:, :3, 3] - scene.bounds.center).norm(dim=1).mean())
         c2w[:, :3, 3] += torch.randn(len(c2w), 3, generator=generator) * (shift_std * distance / 3**0.5)
         return c2w
 
@@ -85,7 +85,7 @@ def add_image_noise(scene: Scene, seed: int, std: float) -> Scene:
 
 
 def add_vignetting(scene: Scene, seed: int, falloff: float) -> Scene:
-    """Darkens all photos, held-out ones too, by `falloff` in the corners, with the squared distance to the centre."""
+    """Darkens all photos, held-out ones too, by `falloff` in the corners, with the squared distance to the center."""
 
     def darken(rgb: Float[Tensor, "V H W 3"]) -> Float[Tensor, "V H W 3"]:
         row, column = ((torch.arange(size) + 0.5) / size * 2 - 1 for size in rgb.shape[1:3])
@@ -116,7 +116,7 @@ def scale_world(scene: Scene, seed: int, factor: float) -> Scene:
 
 def scale_near_far(scene: Scene, seed: int, factor: float) -> Scene:
     """Sets near and far planes that are wrong by a factor."""
-    distance = float(scene.train.cameras.centres.norm(dim=1).mean())
+    distance = float(scene.train.cameras.centers.norm(dim=1).mean())
     radius = float(scene.bounds.half_size.norm())
     near, far = factor * (distance - radius), factor * (distance + radius)
     return replace(scene, bounds=replace(scene.bounds, near=near, far=far))

@@ -25,25 +25,25 @@ Point = tuple[float, float, float]
 class Sphere:
     """A sphere, world units."""
 
-    centre: Point
+    center: Point
     radius: float
     frequency: float = 1.0
     """Spatial frequency of the pattern, see `shade`."""
 
     def intersect(self, rays: Rays) -> tuple[Float[Tensor, "R"], Float[Tensor, "R 3"]]:
         """Distance along each ray to the surface (inf if it misses) and the outward normal there."""
-        offset = rays.origins - torch.tensor(self.centre)
+        offset = rays.origins - torch.tensor(self.center)
         half = (offset * rays.directions).sum(1)
         inside = half**2 - (offset * offset).sum(1) + self.radius**2
         t = torch.where(inside >= 0, -half - inside.clamp_min(0).sqrt(), math.inf)
         t = torch.where(t > 0, t, math.inf)
         points = rays.origins + rays.directions * t.nan_to_num(posinf=0)[:, None]
-        return t, (points - torch.tensor(self.centre)) / self.radius
+        return t, (points - torch.tensor(self.center)) / self.radius
 
     @property
     def aabb(self) -> Float[Tensor, "2 3"]:
-        centre = torch.tensor(self.centre)
-        return torch.stack([centre - self.radius, centre + self.radius])
+        center = torch.tensor(self.center)
+        return torch.stack([center - self.radius, center + self.radius])
 
 
 @dataclass(frozen=True)
@@ -76,17 +76,17 @@ Primitive = Sphere | Box
 def shade(
     points: Float[Tensor, "N 3"], normals: Float[Tensor, "N 3"], frequency: Float[Tensor, "N 1"]
 ) -> Float[Tensor, "N 3"]:
-    """Surface colour: three sine waves scaled by `frequency` (constant for 0), with Lambertian shading."""
+    """Surface color: three sine waves scaled by `frequency` (constant for 0), with Lambertian shading."""
     waves = torch.tensor([[5.0, 2.0, 1.0], [-2.0, 6.0, 3.0], [1.0, -3.0, 7.0]])
-    colour = 0.5 + 0.35 * torch.sin(frequency * points @ waves.T + torch.tensor([0.0, 1.0, 2.0]))
+    color = 0.5 + 0.35 * torch.sin(frequency * points @ waves.T + torch.tensor([0.0, 1.0, 2.0]))
     light = (normals @ torch.tensor(LIGHT_DIRECTION)).clamp_min(0)
-    return colour * (0.45 + 0.55 * light[:, None])
+    return color * (0.45 + 0.55 * light[:, None])
 
 
 def trace_rays(
     primitives: Sequence[Primitive], rays: Rays
 ) -> tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Int[Tensor, "R"]]:
-    """Colour, distance and index of the first primitive along each ray: black, inf and 0 if there is none."""
+    """Color, distance and index of the first primitive along each ray: black, inf and 0 if there is none."""
     distance, normals = torch.full((len(rays),), math.inf), torch.zeros(len(rays), 3)
     index = torch.zeros(len(rays), dtype=torch.long)
     for i, primitive in enumerate(primitives):
@@ -95,8 +95,8 @@ def trace_rays(
         distance, index = torch.where(nearer, t, distance), index.masked_fill(nearer, i)
         normals = torch.where(nearer[:, None], normal, normals)
     points = rays.origins + rays.directions * distance.nan_to_num(posinf=0)[:, None]
-    colour = shade(points, normals, torch.tensor([primitive.frequency for primitive in primitives])[index, None])
-    return torch.where(distance.isfinite()[:, None], colour, 0.0), distance, index
+    color = shade(points, normals, torch.tensor([primitive.frequency for primitive in primitives])[index, None])
+    return torch.where(distance.isfinite()[:, None], color, 0.0), distance, index
 
 
 def render_photos(
@@ -106,8 +106,8 @@ def render_photos(
     fine = cameras.rescale(samples)
     photos = []
     for view in range(len(cameras)):
-        colour, distance, _ = trace_rays(primitives, fine.generate_view_rays(view))
-        layers = torch.cat([colour, distance.isfinite()[:, None].float()], dim=1)
+        color, distance, _ = trace_rays(primitives, fine.generate_view_rays(view))
+        layers = torch.cat([color, distance.isfinite()[:, None].float()], dim=1)
         mean = layers.view(cameras.height, samples, cameras.width, samples, 4).mean((1, 3))
         premultiplied, alpha = mean[..., :3], mean[..., 3:]
         if background is None:
@@ -143,8 +143,8 @@ def bound_primitives(primitives: Sequence[Primitive]) -> Bounds:
     """Bounds of primitives, enlarged by 10 %."""
     boxes = torch.stack([primitive.aabb for primitive in primitives])
     low, high = boxes[:, 0].amin(0), boxes[:, 1].amax(0)
-    centre, half = (low + high) / 2, (high - low) / 2
-    return Bounds(torch.stack([centre - 1.1 * half, centre + 1.1 * half]))
+    center, half = (low + high) / 2, (high - low) / 2
+    return Bounds(torch.stack([center - 1.1 * half, center + 1.1 * half]))
 
 
 def make_object_scene(

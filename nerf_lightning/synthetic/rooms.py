@@ -59,7 +59,7 @@ ROOMS = {
 
 
 def make_handheld_cameras(count: int, width: int, height: int, seed: int) -> Cameras:
-    """Handheld cameras on two rings around the origin, not quite level or centred; width x height pixels."""
+    """Handheld cameras on two rings around the origin, not quite level or centered; width x height pixels."""
     generator = torch.Generator().manual_seed(seed)
 
     def shake() -> Tensor:

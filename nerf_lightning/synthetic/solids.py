@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-PATTERNS = ("plain", "chequer", "stripes", "brickwork")
+PATTERNS = ("plain", "checker", "stripes", "brickwork")
 IDENTITY_AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 
@@ -16,15 +16,15 @@ class Solids(NamedTuple):
     """P solids as arrays: unit cubes or unit cylinders (axis z), scaled, rotated and translated into the world."""
 
     is_cylinder: Bool[np.ndarray, "P"]
-    centre: Float[np.ndarray, "P 3"]
+    center: Float[np.ndarray, "P 3"]
     half_size: Float[np.ndarray, "P 3"]
     """Along the solid's axes; (radius, radius, half length) of a cylinder."""
     axes: Float[np.ndarray, "P 3 3"]
     """Rows are the solid's axes in the world frame."""
-    colour: Float[np.ndarray, "P 3"]
+    color: Float[np.ndarray, "P 3"]
     """Linear RGB, in [0, 1]."""
     accent: Float[np.ndarray, "P 3"]
-    """Second colour of the pattern."""
+    """Second color of the pattern."""
     pattern: Int[np.ndarray, "P"]
     """Index in `PATTERNS`."""
     period: Float[np.ndarray, "P"]
@@ -34,7 +34,7 @@ class Solids(NamedTuple):
 
     @property
     def to_unit(self) -> Float[np.ndarray, "P 3 3"]:
-        """Maps world offsets from the centre to the frame of the unit cube or cylinder."""
+        """Maps world offsets from the center to the frame of the unit cube or cylinder."""
         return self.axes / self.half_size[:, :, None]
 
     @property
@@ -45,12 +45,12 @@ class Solids(NamedTuple):
         # A disc extends radius * sin(angle to its axis), less than its bounding square.
         disc = np.hypot(reach[:, 0], reach[:, 1]) + np.abs(reach[:, 2])
         extent = np.where(self.is_cylinder[:, None], disc, box)
-        return np.stack([(self.centre - extent).min(0), (self.centre + extent).max(0)])
+        return np.stack([(self.center - extent).min(0), (self.center + extent).max(0)])
 
     def to_float32(self) -> "Solids":
         """Casts the geometry to single precision."""
         return self._replace(
-            **{name: getattr(self, name).astype(np.float32) for name in ("centre", "half_size", "axes")}
+            **{name: getattr(self, name).astype(np.float32) for name in ("center", "half_size", "axes")}
         )
 
 
@@ -60,8 +60,8 @@ def load_bulldozer() -> Solids:
     model = json.loads(Path(__file__).with_name("bulldozer.json").read_text(encoding="utf-8"))
     kinds, names, *geometry = zip(*((*row, IDENTITY_AXES)[:5] for row in model["solids"]), strict=True)
     materials = [model["materials"][name] for name in names]
-    keys = ("colour", "accent", "period", "gloss")
+    keys = ("color", "accent", "period", "gloss")
     appearance = {key: np.array([material[key] for material in materials], np.float32) for key in keys}
     pattern = np.array([PATTERNS.index(material["pattern"]) for material in materials])
-    centre, half, axes = (np.array(part, float) for part in geometry)
-    return Solids(np.array(kinds) == "cylinder", centre, half, axes, pattern=pattern, **appearance)
+    center, half, axes = (np.array(part, float) for part in geometry)
+    return Solids(np.array(kinds) == "cylinder", center, half, axes, pattern=pattern, **appearance)

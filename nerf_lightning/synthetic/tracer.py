@@ -1,4 +1,4 @@
-"""Ray tracer of the bulldozer: exact colour, alpha and depth."""
+"""Ray tracer of the bulldozer: exact color, alpha and depth."""
 
 import functools
 from typing import NamedTuple
@@ -16,16 +16,16 @@ SHADOW_MAP_SIZE_PX = 1536
 
 
 def rasterize(solids: Solids, cameras: Cameras, view: int) -> tuple[Int[np.ndarray, "H W"], Float[np.ndarray, "H W"]]:
-    """Index of the first solid at each pixel centre (-1 for none) and its depth along the camera's z axis (inf for none).
+    """Index of the first solid at each pixel center (-1 for none) and its depth along the camera's z axis (inf for none).
 
     Each solid is intersected only within its projected bounding box; all of it must lie in front of the camera.
     """
     K, c2w = (matrix[view].double().numpy() for matrix in (cameras.K, cameras.c2w))
     # In a solid's frame pixel (u, v) has direction lift @ (u, v, 1): linear in rows and columns.
     lift = (solids.to_unit @ c2w[:3, :3] @ np.linalg.inv(K)).astype(np.float32)
-    eye = np.einsum("pij,pj->pi", solids.to_unit, c2w[:3, 3] - solids.centre).astype(np.float32)
+    eye = np.einsum("pij,pj->pi", solids.to_unit, c2w[:3, 3] - solids.center).astype(np.float32)
     signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
-    corners = solids.centre[:, None] + (signs * solids.half_size[:, None]) @ solids.axes
+    corners = solids.center[:, None] + (signs * solids.half_size[:, None]) @ solids.axes
     corners = (corners - c2w[:3, 3]) @ c2w[:3, :3] @ K.T
     pixels = corners[..., :2] / corners[..., 2:]
     size = cameras.width, cameras.height
@@ -50,8 +50,8 @@ def render_shadow_map() -> ShadowMap:
     light, radius = np.array(fast.LIGHT_POSITION, float), float(np.linalg.norm(load_bulldozer().aabb, axis=1).max())
     c2w = look_at(torch.from_numpy(light).float(), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     focal = SHADOW_MAP_SIZE_PX / 2 * float(np.sqrt(light @ light - radius**2)) / radius
-    centre = SHADOW_MAP_SIZE_PX / 2
-    K = torch.tensor([[focal, 0, centre], [0, focal, centre], [0, 0, 1]])
+    center = SHADOW_MAP_SIZE_PX / 2
+    K = torch.tensor([[focal, 0, center], [0, focal, center], [0, 0, 1]])
     cameras = Cameras.pinhole(K[None], c2w[None], SHADOW_MAP_SIZE_PX, SHADOW_MAP_SIZE_PX)
     return ShadowMap(c2w[:3, :3].numpy(), focal, *rasterize(load_bulldozer(), cameras, 0))
 

@@ -1,4 +1,4 @@
-"""LightningModules: training step, losses, metrics and optimiser of NeRF2D and NeRF3D."""
+"""LightningModules: training step, losses, metrics and optimizer of NeRF2D and NeRF3D."""
 
 from nerf_lightning.system.metrics import mse_to_psnr, psnr, ssim
 from nerf_lightning.system.nerf2d import NeRF2D

@@ -36,7 +36,7 @@ EARLY_TRIAL_STEPS, EARLY_REDUCTION_FACTOR = 64, 2
 error reduction: a blurred field follows any motion a little."""
 MIN_ERROR_REDUCTION = {"poses": 0.01, "exposure": 0.05}
 """Relative reduction of most photos' squared error that enables a correction. Exact poses raise the error; gains explain a
-little of any error, and shift the photos' neutral colour."""
+little of any error, and shift the photos' neutral color."""
 RETEST_FRACTION, NUM_DRAWS = 0.5, 4
 """Above this fraction of `MIN_ERROR_REDUCTION` a trial is repeated; the mean of this many pixel draws decides."""
 MAX_PHOTOS, PIXELS_PER_PHOTO = 64, 128
@@ -93,7 +93,7 @@ def render_photo_pixels(render: RenderFn, corrections: Corrections | None, pixel
 def compute_squared_errors(
     output: RenderOutput, corrections: Corrections | None, pixels: PhotoPixels, num_photos: int
 ) -> Float[Tensor, "V"]:
-    """Squared error of each photo, summed over known pixels and channels, with corrected colours if given."""
+    """Squared error of each photo, summed over known pixels and channels, with corrected colors if given."""
     rgb = output.rgb
     if corrections is not None:
         rgb = corrections.color(rgb, output.opacity, pixels.backgrounds, pixels.rays, pixels.views)
@@ -167,7 +167,7 @@ def measure_error_reductions(
     Args:
         render: renders the field.
         views: the training photos.
-        background: the colour behind the scene.
+        background: the color behind the scene.
         corrections: current corrections; not changed.
         generator: draws the pixels.
         exposure: also measures exposure; poses alone are faster.

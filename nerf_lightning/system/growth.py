@@ -37,7 +37,7 @@ def sync_resolution_scale(system: "NeRF3D", data: RayDataModule) -> None:
 
 @torch.no_grad()
 def upsample_field(system: "NeRF3D", data: RayDataModule, stage: int, optimizer: torch.optim.Optimizer) -> None:
-    """Upsamples the field and drops the optimiser state of resized parameters."""
+    """Upsamples the field and drops the optimizer state of resized parameters."""
     for parameter in system.field.upsample(stage):
         optimizer.state.pop(parameter, None)
     sync_resolution_scale(system, data)

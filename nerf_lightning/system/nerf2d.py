@@ -46,7 +46,7 @@ class NeRF2D(System):
 
     @torch.no_grad()
     def query_rgb(self, uv: Float[Tensor, "N 2"]) -> Float[Tensor, "N 3"]:
-        """Field colours at `uv`, clamped to [0, 1], evaluated in chunks."""
+        """Field colors at `uv`, clamped to [0, 1], evaluated in chunks."""
         rgb, size = uv.new_empty(len(uv), 3), PIXELS_PER_CHUNK_SAMPLE * self.chunk
         for target, points in zip(rgb.split(size), uv.split(size), strict=True):
             target.copy_(self.field(points).clamp(0, 1))
@@ -69,4 +69,4 @@ class NeRF2D(System):
     def diagnose(self, view: PictureBatch) -> str:
         rgb = self.query_rgb(view.uv)
         is_constant = (rgb.amax(0) - rgb.amin(0)).max() <= 1 / 255
-        return "the field has the same colour everywhere: lower the learning rate" if is_constant else ""
+        return "the field has the same color everywhere: lower the learning rate" if is_constant else ""

@@ -196,7 +196,7 @@ class NeRF3D(System):
         Args:
             rays: on the system's device.
             near, far: visible range along each ray, in scene units.
-            background: colour in [0, 1]; None takes the renderer's.
+            background: color in [0, 1]; None takes the renderer's.
         """
         color = self.renderer.background.color if background is None else torch.tensor(background, device=self.device)
         outputs, start, num_rays, max_samples = [], 0, self.chunk_rays, SAMPLE_CHUNKS_PER_PASS * self.chunk

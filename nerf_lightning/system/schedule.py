@@ -12,8 +12,11 @@ def _warmup_factor(progress: float, step: int, warmup: float, inverse_sqrt_after
 
 
 def constant(progress: float, step: int = 0, warmup: float = 0.0, inverse_sqrt_after: Count | None = None) -> float:
-    """1 after a linear warm-up over the first `warmup` of the budget, times 1 / sqrt(1 + step / inverse_sqrt_after): a long
-    training at the learning rate of a short one loses quality."""
+    """Constant factor 1 after a linear warm-up over the first `warmup` of the budget.
+
+    All schedules: with `inverse_sqrt_after`, times 1 / sqrt(1 + step / inverse_sqrt_after), as a long training at the
+    learning rate of a short one loses quality.
+    """
     return _warmup_factor(progress, step, warmup, inverse_sqrt_after)
 
 
@@ -24,7 +27,7 @@ def exponential(
     final_factor: float = 0.1,
     inverse_sqrt_after: Count | None = None,
 ) -> float:
-    """`constant` times final_factor^progress: from 1 down to `final_factor`."""
+    """Exponential decay from 1 to `final_factor`, times `constant` (warm-up)."""
     return _warmup_factor(progress, step, warmup, inverse_sqrt_after) * final_factor**progress
 
 
@@ -35,6 +38,6 @@ def cosine(
     final_factor: float = 0.0,
     inverse_sqrt_after: Count | None = None,
 ) -> float:
-    """`constant` times half a cosine from 1 down to `final_factor`."""
+    """Cosine decay from 1 to `final_factor`, times `constant` (warm-up)."""
     factor = final_factor + (1 - final_factor) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0)))
     return _warmup_factor(progress, step, warmup, inverse_sqrt_after) * factor

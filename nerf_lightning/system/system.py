@@ -1,4 +1,4 @@
-"""Base class of NeRF2D and NeRF3D: optimiser, schedule, and evaluation of whole views."""
+"""Base class of NeRF2D and NeRF3D: optimizer, schedule, and evaluation of whole views."""
 
 import math
 import time
@@ -54,7 +54,7 @@ class StepStats:
 
 @dataclass(frozen=True)
 class ViewResult:
-    """A rendered view and its ground truth. Colours in [0, 1]."""
+    """A rendered view and its ground truth. Colors in [0, 1]."""
 
     rgb: Float[Tensor, "H W 3"]
     truth: Float[Tensor, "H W 3"]
@@ -99,7 +99,7 @@ class System(L.LightningModule):
 
     Args:
         field: uv -> rgb, or position, direction -> density, rgb.
-        optimizer: makes the optimiser from the parameter groups.
+        optimizer: makes the optimizer from the parameter groups.
         schedule: factor on the learning rate by progress and step.
         seed: of all randomness in training steps.
         chunk: samples rendered at once without gradient; bounds the memory of a view.
@@ -154,7 +154,7 @@ class System(L.LightningModule):
         sum_losses(losses).backward()
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Named parameter groups of the optimiser; one without `lr` takes the optimiser's."""
+        """Named parameter groups of the optimizer; one without `lr` takes the optimizer's."""
         return [{"name": "field", "params": list(self.parameters())}]
 
     def lr_factors(self, progress: float, step: int) -> dict[str, float]:
@@ -184,18 +184,18 @@ class System(L.LightningModule):
         """Called when training restarts at `step` with fresh weights."""
 
     def compute_target_rgb(self, batch: Any) -> Float[Tensor, "N 3"]:
-        """Target colours of an evaluation batch."""
+        """Target colors of an evaluation batch."""
         raise TypeError(f"{type(self).__name__} must define compute_target_rgb(batch)")
 
     def render_view(
         self, view: Any
     ) -> tuple[Float[Tensor, "N 3"], Float[Tensor, "N"] | None, Float[Tensor, "N"] | None]:
-        """Rendered colours of a whole view, with depth and opacity if the field has them."""
+        """Rendered colors of a whole view, with depth and opacity if the field has them."""
         raise TypeError(f"{type(self).__name__} must define render_view(view)")
 
     @property
     def background(self) -> list[float] | None:
-        """Background colour of evaluated views; None for an image."""
+        """Background color of evaluated views; None for an image."""
         return None
 
     def measure_off_grid_psnr(self, view: Any) -> float | None:

@@ -34,15 +34,15 @@ def _assume_constant(function: Callable[..., Any]) -> Callable[..., Any]:
     """Makes a function's results constants of the graph: parameters, whose size the compiler takes as fixed."""
 
     @torch._dynamo.assume_constant_result
-    def boxed(*args: Any) -> list[Any]:  # in a list: one graph cannot take two single tensors of the same name
+    def call_boxed(*args: Any) -> list[Any]:  # in a list: one graph cannot take two single tensors of the same name
         return [
             tree_map_only(torch.Tensor, lambda x: torch.nn.Parameter(x.clone(), requires_grad=False), function(*args))
         ]
 
-    def unboxed(*args: Any) -> Any:
-        return boxed(*args)[0]
+    def call_unboxed(*args: Any) -> Any:
+        return call_boxed(*args)[0]
 
-    return unboxed
+    return call_unboxed
 
 
 def _canonicalize(value: Any) -> Any:

@@ -76,7 +76,7 @@ def continue_job(cfg: DictConfig, folder: Path) -> float | None:
 
 
 def find_progress(run: RunSummary, cfg: DictConfig) -> tuple[RunSummary | None, Path | None]:
-    """Finds how far a run with this configuration got.
+    """Finds whether a run with this configuration is finished, and what it can continue from.
 
     Returns:
         The run, if it is finished; otherwise its last checkpoint, if there is one to continue from.

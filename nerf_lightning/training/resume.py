@@ -15,8 +15,15 @@ from nerf_lightning.runs.reload import reload_data
 from nerf_lightning.runs.scene_file import read_scene_file
 
 
-def resume(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
-    """Configuration of the run in `folder` with this command line's overrides, and its last checkpoint."""
+def compose_resumed_config(cfg: DictConfig, folder: Path) -> tuple[DictConfig, Path]:
+    """Composes the configuration of the run in `folder` with this command line's overrides.
+
+    Returns:
+        The configuration, and the run's last checkpoint, to continue from.
+
+    Raises:
+        InputError: a damaged checkpoint, or an override of an option that the run does not have.
+    """
     saved = load_config(folder)
     checkpoint = folder / "checkpoints" / "last.ckpt"
     read_checkpoint(checkpoint, RESUME_KEYS)  # raises before anything starts, if it is damaged

@@ -38,7 +38,7 @@ from nerf_lightning.system.torch_compile import COMPILE_BACKEND, check_compiler
 from nerf_lightning.training.loggers import finish_wandb, log_summary
 from nerf_lightning.training.process import check_processes, prepare_process, warm_up
 from nerf_lightning.training.report import report_photos, report_results
-from nerf_lightning.training.resume import load_data, resume
+from nerf_lightning.training.resume import compose_resumed_config, load_data
 from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.memory import check_memory, out_of_memory_error
@@ -77,7 +77,7 @@ def train(
     folder = folder or Path(HydraConfig.get().runtime.output_dir)
     is_resumed = cfg.resume is not None
     if is_resumed:
-        cfg, checkpoint = resume(cfg, folder)
+        cfg, checkpoint = compose_resumed_config(cfg, folder)
     device = prepare(cfg)
     data = load_data(cfg, scene, folder if is_resumed else None)
     run = build_run(cfg, data, device, folder, checkpoint)

@@ -15,7 +15,7 @@ class Stream(IntEnum):
     STEP = 1
     """Jitter, random backgrounds and occupancy updates within a step."""
     BASELINE = 2
-    """Pixels for the error of a constant colour."""
+    """Pixels for the error of a constant color."""
     RESTART = 3
     """New initial weights after divergence."""
     ANALYSIS = 4

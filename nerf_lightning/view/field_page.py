@@ -14,7 +14,7 @@ from viser.transforms import SO3
 from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Scene
 from nerf_lightning.drawing.channels import CHANNELS
-from nerf_lightning.drawing.style import GREEN, GREY, VERMILLION, parse_hex_colour
+from nerf_lightning.drawing.style import GRAY, GREEN, VERMILLION, parse_hex_color
 from nerf_lightning.renderer.background import COLORS
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.view.geometry import compute_box_edges, get_home_viewpoint
@@ -125,7 +125,7 @@ class FieldPage(Page):
             for control in (self.channel, self.background, self.max_side, self.near, self.far):
                 control.on_update(lambda _: self._request_images())
         with gui.add_folder("show"):
-            self.draw_lines("/box", compute_box_edges(self.system.field.bounds.aabb.cpu()), parse_hex_colour(GREY))
+            self.draw_lines("/box", compute_box_edges(self.system.field.bounds.aabb.cpu()), parse_hex_color(GRAY))
             box = self.server.scene.get_handle_by_name("/box")
             assert box is not None  # it has edges
             box.visible = False
@@ -164,12 +164,12 @@ class FieldPage(Page):
         far = torch.minimum(torch.maximum(far, near), near + 4 * self.scale)
         ends = torch.stack([ray.origins.cpu() + t[:, None] * ray.directions.cpu() for t in (near, far)], dim=1)
         with self.draw_lock, self.server.atomic():
-            self.draw_lines("/ray/inside", ends.numpy(), parse_hex_colour(GREEN))
-            self.points("/ray/samples", positions.cpu().numpy(), parse_hex_colour(VERMILLION), 0.006)
+            self.draw_lines("/ray/inside", ends.numpy(), parse_hex_color(GREEN))
+            self.points("/ray/samples", positions.cpu().numpy(), parse_hex_color(VERMILLION), 0.006)
         color = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])
         depth, opacity = float(rendered.depth[0]), float(rendered.opacity[0])
         self.status.content = (
-            f"clicked: {len(samples)} samples, colour {color}, opacity {opacity:.2f}, depth {depth:.3f}"
+            f"clicked: {len(samples)} samples, color {color}, opacity {opacity:.2f}, depth {depth:.3f}"
         )
 
     def build_request(self, client_state: ClientState) -> ViewRequest:
@@ -191,7 +191,7 @@ class FieldPage(Page):
             return min(pending, key=lambda state: (state.side, state.last_render_time), default=None)
 
     def render_next(self, seconds: float = FIRST_IMAGE_SECONDS) -> bool:
-        """Renders one image for the client with the coarsest.
+        """Renders a finer image for the client whose image is coarsest.
 
         Args:
             seconds: render time of the first image of a view.

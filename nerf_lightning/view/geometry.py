@@ -18,12 +18,12 @@ from nerf_lightning.utils.text import subsample
 OVERVIEW_FOV = math.radians(50)
 """Vertical field of view of the overview, radians."""
 MAX_POINTS, COLOR_VIEWS = 40_000, 24
-"""Limits for displayed points, and for photos that colour them."""
+"""Limits for displayed points, and for photos that color them."""
 
 
 @dataclass(frozen=True)
 class Frustum:
-    """A camera frustum with its photo; assumes a centred principal point."""
+    """A camera frustum with its photo; assumes a centered principal point."""
 
     name: str
     c2w: Float[np.ndarray, "4 4"]
@@ -86,28 +86,28 @@ def build_ray_figure(rays: Rays, bounds: Bounds, samples: int, stump: float) -> 
     near, far = bounds.near_far(rays)
     hit = far > near
 
-    def points_at(t: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:
+    def compute_points(t: Float[Tensor, "R S"]) -> Float[Tensor, "R S 3"]:
         return rays.origins[:, None] + t[..., None] * rays.directions[:, None]
 
     fractions = (torch.arange(samples) + 0.5) / samples
     entry = torch.where(hit, near, torch.full_like(near, stump))
     return RayFigure(
-        points_at(torch.stack([torch.zeros_like(near), entry], dim=1)).numpy(),
-        points_at(torch.stack([near, far], dim=1))[hit].numpy(),
-        points_at(near[:, None] + fractions * (far - near)[:, None])[hit].flatten(0, 1).numpy(),
+        compute_points(torch.stack([torch.zeros_like(near), entry], dim=1)).numpy(),
+        compute_points(torch.stack([near, far], dim=1))[hit].numpy(),
+        compute_points(near[:, None] + fractions * (far - near)[:, None])[hit].flatten(0, 1).numpy(),
     )
 
 
 def color_points(
     points: Float[Tensor, "P 3"], views: Views
 ) -> tuple[Float[np.ndarray, "N 3"], UInt8[np.ndarray, "N 3"]]:
-    """Subsamples points and colours each from the closest photo that sees it; grey if none does."""
+    """Subsamples points and colors each from the closest photo that sees it; gray if none does."""
     points = points[subsample(len(points), MAX_POINTS)].float()
     rgb = torch.full((len(points), 3), 128, dtype=torch.uint8)
     nearest = torch.full((len(points),), math.inf)
     for view in subsample(len(views), COLOR_VIEWS):
         pixels, _, seen = views.cameras.project(points, view)
-        distance = (points - views.cameras.centres[view]).norm(dim=1)
+        distance = (points - views.cameras.centers[view]).norm(dim=1)
         closer = seen & (distance < nearest)
         col, row = pixels[closer].long().unbind(1)
         rgb[closer], nearest[closer] = views.image(view)[row, col, :3], distance[closer]
@@ -123,8 +123,8 @@ def compute_box_edges(aabb: Float[Tensor, "2 3"]) -> Float[np.ndarray, "12 2 3"]
 
 def compute_path_segments(cameras: Cameras) -> Float[np.ndarray, "N 2 3"]:
     """Segments between consecutive views; closed if the last is about as close to the first as to its predecessor."""
-    centres = cameras.centres.numpy()
-    segments = np.stack([centres, np.roll(centres, -1, axis=0)], axis=1)
+    centers = cameras.centers.numpy()
+    segments = np.stack([centers, np.roll(centers, -1, axis=0)], axis=1)
     lengths = np.linalg.norm(segments[:, 1] - segments[:, 0], axis=1)
     closed = len(segments) > 2 and lengths[-1] <= 1.5 * lengths[:-1].max()
     return segments if closed else segments[:-1]
@@ -134,16 +134,16 @@ def get_home_viewpoint(orbit: Cameras) -> tuple[Viewpoint, float]:
     """The first view of an orbit as a viewpoint, and the mean distance to its focus."""
     focus = find_pivot(orbit)
     up = mean_up(orbit)
-    distance = float((orbit.centres - focus).norm(dim=1).mean())
+    distance = float((orbit.centers - focus).norm(dim=1).mean())
     fov = 2 * math.atan(orbit.height / (2 * float(orbit.K[0, 1, 1])))
-    home = Viewpoint(orbit.centres[0].numpy(), focus.numpy(), up.numpy(), fov)
+    home = Viewpoint(orbit.centers[0].numpy(), focus.numpy(), up.numpy(), fov)
     return home, max(distance, 1e-6)
 
 
 def get_overview_viewpoint(scene: Scene) -> Viewpoint:
     """A viewpoint behind the orbit's start that shows all cameras and the bounds."""
     home, _ = get_home_viewpoint(scene.orbit)
-    points = torch.cat([scene.train.cameras.centres, scene.val.cameras.centres, scene.bounds.aabb]).numpy()
+    points = torch.cat([scene.train.cameras.centers, scene.val.cameras.centers, scene.bounds.aabb]).numpy()
     radius = max(float(np.linalg.norm(points - home.look_at, axis=1).max()), 1e-6)
     offset = home.position - home.look_at
     offset *= radius / math.sin(OVERVIEW_FOV / 2) / max(float(np.linalg.norm(offset)), 1e-6)

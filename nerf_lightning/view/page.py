@@ -12,11 +12,11 @@ import viser
 from viser.transforms import SO3
 
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.drawing.style import BLUE, ORANGE, parse_hex_colour
+from nerf_lightning.drawing.style import BLUE, ORANGE, parse_hex_color
 from nerf_lightning.view.geometry import Frustum, Viewpoint, get_photo_viewpoint, iterate_frusta
 
-SPLIT_COLORS = {"training": parse_hex_colour(BLUE), "held out": parse_hex_colour(ORANGE)}
-"""Frustum colours by split."""
+SPLIT_COLORS = {"training": parse_hex_color(BLUE), "held out": parse_hex_color(ORANGE)}
+"""Frustum colors by split."""
 MAX_PHOTO_SIDE = 160
 """Longest side of photos on frusta, pixels."""
 LINE_WIDTH = 1.5
@@ -154,7 +154,7 @@ class Page:
         self.server.scene.add_line_segments(name, segments, color, thickness=LINE_WIDTH, thickness_units="screen")
 
     def points(self, name: str, points: np.ndarray, color: tuple[int, int, int] | np.ndarray, size: float) -> None:
-        """Draws points [N, 3] in one colour or [N, 3], replacing the node `name`; `size` is relative to `scale`."""
+        """Draws points [N, 3] in one color or [N, 3], replacing the node `name`; `size` is relative to `scale`."""
         if not len(points):
             self.server.scene.remove_by_name(name)
             return

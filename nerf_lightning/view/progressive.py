@@ -1,4 +1,4 @@
-"""Progressive rendering for browsers: coarse to fine, cancelled when outdated."""
+"""Progressive rendering for browsers: coarse to fine, canceled when outdated."""
 
 import math
 import time
@@ -72,7 +72,7 @@ class ProgressiveRenderer:
         return int(min(max(math.sqrt(area / ratio), MIN_SIDE), request.max_side))
 
     def get_depth_range(self) -> tuple[float, float]:
-        """Depth range of the colour map, bright to dark; cached."""
+        """Depth range of the color map, bright to dark; cached."""
         if self._depths is None:
             self._depths = measure_depth_range(self.system, self.orbit[torch.tensor(subsample(len(self.orbit), 3))])
         return self._depths
@@ -82,7 +82,7 @@ class ProgressiveRenderer:
         self._depths = None
 
     def render(self, request: ViewRequest, side: int, is_current: Callable[[], bool]) -> UInt8[ndarray, "H W 3"] | None:
-        """Renders a request at one resolution; None if cancelled by `is_current`."""
+        """Renders a request at one resolution; None if canceled by `is_current`."""
         style = FrameStyle(
             (request.channel,), request.background, self.get_depth_range() if request.channel == "depth" else (0.0, 1.0)
         )

@@ -3,7 +3,7 @@
 import torch
 
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.drawing.style import GREEN, GREY, MAUVE, SKY, VERMILLION, parse_hex_colour
+from nerf_lightning.drawing.style import GRAY, GREEN, MAUVE, SKY, VERMILLION, parse_hex_color
 from nerf_lightning.view.geometry import (
     build_ray_figure,
     color_points,
@@ -41,9 +41,9 @@ class ScenePage(Page):
         scene = self.server.scene
         if self.scene.points is not None:
             self.points("/points", *color_points(self.scene.points, self.scene.train), 0.006)
-        self.draw_lines("/orbit", compute_path_segments(self.scene.orbit), parse_hex_colour(MAUVE))
-        self.draw_lines("/box", compute_box_edges(self.scene.bounds.aabb), parse_hex_colour(GREY))
-        self.points("/focus", self.home.look_at[None], parse_hex_colour(VERMILLION), 0.02)
+        self.draw_lines("/orbit", compute_path_segments(self.scene.orbit), parse_hex_color(MAUVE))
+        self.draw_lines("/box", compute_box_edges(self.scene.bounds.aabb), parse_hex_color(GRAY))
+        self.points("/focus", self.home.look_at[None], parse_hex_color(VERMILLION), 0.02)
         scene.add_frame("/axes", axes_length=0.2 * self.scale, axes_radius=0.003 * self.scale)
         self.ray_group = scene.add_frame("/rays", show_axes=False)
 
@@ -78,6 +78,6 @@ class ScenePage(Page):
             views = torch.arange(len(cameras)).repeat_interleave(self.rays.value)
             rays = sample_random_rays(cameras, views, torch.Generator().manual_seed(self.seed))
             figure = build_ray_figure(rays, self.scene.bounds, self.samples.value, self.scale)
-            self.draw_lines("/rays/approach", figure.approach, parse_hex_colour(SKY))
-            self.draw_lines("/rays/inside", figure.inside, parse_hex_colour(GREEN))
-            self.points("/rays/samples", figure.samples, parse_hex_colour(VERMILLION), 0.006)
+            self.draw_lines("/rays/approach", figure.approach, parse_hex_color(SKY))
+            self.draw_lines("/rays/inside", figure.inside, parse_hex_color(GREEN))
+            self.points("/rays/samples", figure.samples, parse_hex_color(VERMILLION), 0.006)

@@ -88,7 +88,7 @@ def trainer_with(tmp_path: Path) -> Callable[..., L.Trainer]:
     def make(*callbacks: L.Callback) -> L.Trainer:
         trainer = Mock(spec=L.Trainer)
         trainer.callbacks = list(callbacks)
-        trainer.datamodule = Data(Picture("grey", "test", torch.zeros(4, 4, 3, dtype=torch.uint8)))
+        trainer.datamodule = Data(Picture("gray", "test", torch.zeros(4, 4, 3, dtype=torch.uint8)))
         trainer.global_step, trainer.should_stop = 0, False
         trainer.default_root_dir = str(tmp_path)
         trainer.logger = Mock()

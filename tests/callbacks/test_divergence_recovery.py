@@ -23,15 +23,15 @@ from nerf_lightning.utils.libraries import silence_lightning
 
 
 class Blob(PictureField):
-    """A free colour per pixel: learns quickly at any learning rate below one."""
+    """A free color per pixel: learns quickly at any learning rate below one."""
 
     def __init__(self):
         super().__init__((8, 8))
-        self.colours = torch.nn.Parameter(torch.full((64, 3), 0.5))
+        self.colors = torch.nn.Parameter(torch.full((64, 3), 0.5))
 
     def forward(self, uv: torch.Tensor) -> torch.Tensor:
         column, row = (uv * 8).long().unbind(1)
-        return self.colours[row * 8 + column]
+        return self.colors[row * 8 + column]
 
 
 def stripes() -> Picture:
@@ -59,28 +59,28 @@ class BrokenSystem(NeRF2D):
             case "nan weight":
                 self.has_failed = True
                 with torch.no_grad():
-                    self.field.colours[:, 0] = math.nan  # the step's own gradient is fine
+                    self.field.colors[:, 0] = math.nan  # the step's own gradient is fine
             case "rise" if self.state.lr_scale == 1:
                 with torch.no_grad():
-                    self.field.colours.uniform_()
+                    self.field.colors.uniform_()
             case "spike":
                 self.has_failed = True
                 with torch.no_grad():
-                    self.field.colours.copy_(1 - self.field.colours)
+                    self.field.colors.copy_(1 - self.field.colors)
             case "rise a little" if self.state.lr_scale == 1:
                 self.set_error(0.4 if self.global_step < 200 else 0.5)
             case "hover" if self.state.lr_scale == 1:  # two steps down, one up
                 self.set_error(1.3 - 0.0004 * self.global_step + 0.1 * (self.global_step // 10 % 3 == 2))
             case "no gradient":
-                return loss * 0 + (self.field.colours * 0).sum()
+                return loss * 0 + (self.field.colors * 0).sum()
         return loss
 
     @torch.no_grad()
     def set_error(self, error: float) -> None:
-        """Sets the field to the stripes with a given fraction of their mean colour's error."""
+        """Sets the field to the stripes with a given fraction of their mean color's error."""
         truth = torch.zeros(8, 8, 3)
         truth[::2] = 1
-        self.field.colours.copy_((0.5 + (1 - error**0.5) * (truth - 0.5)).view(64, 3))
+        self.field.colors.copy_((0.5 + (1 - error**0.5) * (truth - 0.5)).view(64, 3))
 
 
 def run(
@@ -127,8 +127,8 @@ def test_recovery_broken_step_restores_last_good_weights(
 @pytest.mark.parametrize(
     ("failure", "words", "action"),
     [
-        ("rise a little", "times that of a constant colour, and has stayed above that since", "last good weights"),
-        ("hover", "times that of a constant colour", "started again with 0.2 times"),
+        ("rise a little", "times that of a constant color, and has stayed above that since", "last good weights"),
+        ("hover", "times that of a constant color", "started again with 0.2 times"),
     ],
 )
 def test_recovery_stalled_training_restarts(failure: str, words: str, action: str, tmp_path: Path):

@@ -139,8 +139,8 @@ class Ramp(PictureField):
 def ramp(width: int, height: int) -> np.ndarray:
     """`Ramp` rendered at a given size."""
     red, green = ((np.arange(n) + 0.5) / n for n in (width, height))
-    colours = np.stack(np.broadcast_arrays(red, green[:, None], 0.5), axis=-1)
-    return np.rint(colours.astype(np.float32) * 255).astype(np.uint8)
+    colors = np.stack(np.broadcast_arrays(red, green[:, None], 0.5), axis=-1)
+    return np.rint(colors.astype(np.float32) * 255).astype(np.uint8)
 
 
 @pytest.fixture
@@ -161,7 +161,7 @@ def test_upscale_builtin_picture_is_compared_with_truth(scale, side, upscale, tm
     scores = upscale(build_picture_data(max_side=24), scale)
     made = imageio.imread(tmp_path / "enlarged.png")
     truth, small = make_builtin_picture(side).numpy(), make_builtin_picture(24).numpy()
-    assert np.array_equal(made, ramp(side, side)), "a field is seen at the finer pixels' centres"
+    assert np.array_equal(made, ramp(side, side)), "a field is seen at the finer pixels' centers"
     method = cv2.INTER_CUBIC if scale > 1 else cv2.INTER_AREA
     bicubic = compute_psnr(cv2.resize(small, (side, side), interpolation=method), truth)
     size = {"scale": scale, "width": side, "height": side}

@@ -49,7 +49,7 @@ def test_near_far_of_random_rays_agrees_with_marching(kind):
 @pytest.mark.parametrize(("unbounded", "reach"), [(False, 1.1), (True, 0.9), (True, 20.0)])
 def test_to_world_of_unit_positions_inverts_to_unit(unbounded, reach):
     bounds = Bounds(BOX.double(), unbounded)
-    world = bounds.centre + reach * bounds.half_size * torch.rand(500, 3).double().mul(2).sub(1)
+    world = bounds.center + reach * bounds.half_size * torch.rand(500, 3).double().mul(2).sub(1)
     torch.testing.assert_close(bounds.to_world(bounds.to_unit(world)), world)
     unit = torch.rand(500, 3).double()
     torch.testing.assert_close(bounds.to_unit(bounds.to_world(unit)), unit)
@@ -62,7 +62,7 @@ def test_to_unit_unbounded_contracts_outside_positions():
     far = bounds.to_unit(torch.randn(1000, 3) * torch.logspace(-2, 8, 1000)[:, None])
     assert far.min() >= 0 and far.max() <= 1
     # Twice and ten times the half-size along x: |x| = 2 - 1/r, a quarter of the cube for each unit.
-    away = bounds.centre + torch.tensor([[2.0, 0, 0], [-10.0, 0, 0]]) * bounds.half_size
+    away = bounds.center + torch.tensor([[2.0, 0, 0], [-10.0, 0, 0]]) * bounds.half_size
     torch.testing.assert_close(bounds.to_unit(away)[:, 0], torch.tensor([0.5 + 0.25 * 1.5, 0.5 - 0.25 * 1.9]))
     assert bounds.to_world(torch.tensor([[0.0, 1.0, 0.5], [1.0, 1.0, 1.0]])).isfinite().all()
 

@@ -5,7 +5,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from nerf_lightning.cameras import CameraLayout, classify_layout
-from tests.helpers.camera_paths import CENTRE, corridor, dome, forward, look_in_directions, pan, ring_poses, walk
+from tests.helpers.camera_paths import CENTER, corridor, dome, forward, look_in_directions, pan, ring_poses, walk
 
 CASES = [
     *((f"ring {yaw}", ring_poses(yaw=yaw), CameraLayout.INWARD) for yaw in (0, 30)),
@@ -19,7 +19,7 @@ CASES = [
     ("walk", walk(), CameraLayout.WALK),
     (
         "arm's length",
-        look_in_directions(CENTRE + 0.6 * pan()[:, :3, 2], torch.linspace(0, 6, 24), torch.zeros(24)),
+        look_in_directions(CENTER + 0.6 * pan()[:, :3, 2], torch.linspace(0, 6, 24), torch.zeros(24)),
         CameraLayout.WALK,
     ),
     ("corridor", corridor(), CameraLayout.WALK),
@@ -42,9 +42,9 @@ def test_classify_layout_with_points_separates_pan_and_walk():
     c2w = pan(0.3)
     directions = torch.randn(500, 3, generator=torch.Generator().manual_seed(1)).double()
     directions = directions / directions.norm(dim=1, keepdim=True)
-    assert classify_layout(c2w, CENTRE + 100 * directions) == CameraLayout.PAN
-    assert classify_layout(c2w, CENTRE + 3 * directions) == CameraLayout.WALK
-    wall = CENTRE + torch.tensor([2.0, 0, 0])
+    assert classify_layout(c2w, CENTER + 100 * directions) == CameraLayout.PAN
+    assert classify_layout(c2w, CENTER + 3 * directions) == CameraLayout.WALK
+    wall = CENTER + torch.tensor([2.0, 0, 0])
     assert classify_layout(forward(0), wall + 0.2 * directions) == CameraLayout.FORWARD
     strip = forward(0)
     strip[:, 1, 3] = torch.linspace(-20, 20, len(strip)).double()

@@ -10,7 +10,7 @@ def cameras() -> Cameras:
     return Cameras.pinhole(random_K(3), random_poses(3), width=7, height=5)
 
 
-def test_generate_rays_of_pixels_pass_pixel_centres(cameras):
+def test_generate_rays_of_pixels_pass_pixel_centers(cameras):
     view, row, col = torch.tensor([2, 0, 1, 2]), torch.tensor([4, 0, 3, 1]), torch.tensor([6, 0, 2, 5])
     rays = cameras.generate_rays(view, row, col)
     for i in range(4):
@@ -34,5 +34,5 @@ def test_resize_to_other_grids_keeps_rays(cameras, width, height):
 
 def test_getitem_with_any_index_picks_views(cameras):
     picked = cameras[torch.tensor([2, 0])]
-    assert len(picked) == 2 and torch.equal(picked.centres, cameras.c2w[[2, 0], :3, 3])
+    assert len(picked) == 2 and torch.equal(picked.centers, cameras.c2w[[2, 0], :3, 3])
     assert torch.equal(picked.K, cameras.K[[2, 0]]) and (picked.width, picked.height) == (7, 5)

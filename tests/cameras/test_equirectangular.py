@@ -44,7 +44,7 @@ def test_project_equirectangular_sees_every_direction():
     cameras = random_pose_cameras()
     edges = [[0, 1.0, 0], [0, -1, 0], [-0.0, 0, -1], [1e-9, 0, -1], [-1e-9, 0, -1], [1e-9, 1, 0]]
     local = torch.cat([torch.tensor(edges), DIRECTIONS])
-    pixels, _, inside = cameras.project(cameras.centres + local @ cameras.c2w[0, :3, :3].T, 0)
+    pixels, _, inside = cameras.project(cameras.centers + local @ cameras.c2w[0, :3, :3].T, 0)
     assert inside.all(), "the poles and the seam too"
     col, row = pixels.long().unbind(1)
     seen = cameras.generate_rays(torch.zeros_like(row), row, col).directions @ cameras.c2w[0, :3, :3]
@@ -61,7 +61,7 @@ def test_to_pinhole_equirectangular_is_90_degrees_wide():
     mixed = Cameras(K, around.c2w.repeat(2, 1, 1), torch.tensor([[15, 10], [WIDTH, HEIGHT]]), lenses)
     pinholes = mixed.to_pinhole()
     assert pinholes.lenses is None and torch.equal(pinholes.K[0], K[0]) and torch.equal(pinholes.c2w, mixed.c2w)
-    assert pinholes.sizes.tolist() == [[15, 10], [20, 15]], "64 pixels for 360 degrees, the same at the centre"
+    assert pinholes.sizes.tolist() == [[15, 10], [20, 15]], "64 pixels for 360 degrees, the same at the center"
     assert pinholes.to_pinhole() is pinholes
     u = torch.tensor([0.0, 20.0])
     across = (u - pinholes.K[1, 0, 2]) / pinholes.K[1, 0, 0]

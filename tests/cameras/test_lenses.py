@@ -27,7 +27,7 @@ def make_lens_cameras(name: str) -> Cameras:
 
 
 def opencv_distortion(name: str, row: torch.Tensor, col: torch.Tensor) -> np.ndarray:
-    """Directions by OpenCV, whose pixel centres are at integers."""
+    """Directions by OpenCV, whose pixel centers are at integers."""
     d, projection = MODELS[name]
     seen = torch.stack([col, row], dim=1).double().numpy()[:, None]
     intrinsics = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])

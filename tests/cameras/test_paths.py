@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Cameras, find_pivot, make_orbit_path, make_spiral_path
 from nerf_lightning.dataset.region import find_region
-from tests.helpers.camera_paths import CENTRE, RADIUS, UP, corridor, dome, forward, pan, ring_poses, walk
+from tests.helpers.camera_paths import CENTER, RADIUS, UP, corridor, dome, forward, pan, ring_poses, walk
 
 LAYOUT_POSES = {
     "ring": ring_poses(),
@@ -33,7 +33,7 @@ def make_cameras(c2w: torch.Tensor) -> Cameras:
 
 def make_orbit(c2w: torch.Tensor, frames: int) -> Cameras:
     region = find_region(c2w)
-    return make_orbit_path(make_cameras(c2w), region.layout, region.centre, frames)
+    return make_orbit_path(make_cameras(c2w), region.layout, region.center, frames)
 
 
 @pytest.mark.parametrize("frames", [1, 60])
@@ -48,31 +48,31 @@ def test_make_orbit_path_and_spiral_stay_near_the_photos(c2w: torch.Tensor, fram
         torch.testing.assert_close(R @ R.mT, torch.eye(3).expand_as(R), atol=1e-4, rtol=0)
         assert (torch.linalg.det(R) > 0).all() and path.c2w.isfinite().all()
         assert (path.c2w[:, :3, 1] @ UP.float()).max() < 0.1, "upright"
-    distances = torch.cdist(orbit.centres, cameras.centres)
-    spacing = torch.cdist(cameras.centres, cameras.centres).fill_diagonal_(math.inf).amin(1)
-    size = float((cameras.centres - cameras.centres.mean(0)).norm(dim=1).max())
+    distances = torch.cdist(orbit.centers, cameras.centers)
+    spacing = torch.cdist(cameras.centers, cameras.centers).fill_diagonal_(math.inf).amin(1)
+    size = float((cameras.centers - cameras.centers.mean(0)).norm(dim=1).max())
     limit = max(0.35 * size, float(spacing[spacing < math.inf].max()) if len(c2w) > 1 else 0.0)
     assert float(distances.amin(1).max()) <= limit + 1e-3, "no view far from all photos"
     # Each view looks within 45 degrees of a photo's direction.
     assert (orbit.c2w[:, :3, 2] @ cameras.c2w[:, :3, 2].T).amax(1).min() > 0.7
     if frames == 60:
-        step = (orbit.centres.roll(-1, 0) - orbit.centres).norm(dim=1)
+        step = (orbit.centers.roll(-1, 0) - orbit.centers).norm(dim=1)
         assert float(step.max()) < 0.25 * max(size, 1e-3), "no jump, from the last to the first neither"
     pivot = find_pivot(orbit)
-    assert pivot.isfinite().all() and float((pivot - orbit.centres[0]).norm()) > 1e-3
+    assert pivot.isfinite().all() and float((pivot - orbit.centers[0]).norm()) > 1e-3
 
 
 @pytest.mark.parametrize("yaw", [0, 20])
 def test_make_orbit_path_of_ring_is_a_full_turn(yaw: int):
     orbit = make_orbit(ring_poses(yaw=yaw), 8)
     assert (orbit.width, orbit.height) == (32, 24) and torch.equal(orbit.K, make_cameras(ring_poses()).K[:8])
-    offset = orbit.centres - CENTRE.float()
+    offset = orbit.centers - CENTER.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((8,), RADIUS), atol=0.05, rtol=0)
     torch.testing.assert_close(orbit.c2w[:, :3, 2], -normalize(offset, dim=1), atol=0.05, rtol=0)
     turn = torch.atan2(offset[:, 1], offset[:, 0])
     steps = torch.remainder(turn.roll(-1) - turn, 2 * math.pi)
     torch.testing.assert_close(steps, torch.full((8,), math.pi / 4), atol=0.05, rtol=0)
-    torch.testing.assert_close(find_pivot(orbit), CENTRE.float(), atol=0.05, rtol=0)
+    torch.testing.assert_close(find_pivot(orbit), CENTER.float(), atol=0.05, rtol=0)
 
 
 def test_make_orbit_path_of_portrait_photos_is_upright_and_portrait():
@@ -84,9 +84,9 @@ def test_make_orbit_path_of_portrait_photos_is_upright_and_portrait():
 
 def test_make_orbit_path_of_arc_and_half_pan_swings():
     arc, pans = make_orbit(ring_poses(24, degrees=150), 60), make_orbit(pan(degrees=150), 60)
-    offset = arc.centres - CENTRE.float()
+    offset = arc.centers - CENTER.float()
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.02, rtol=0)
-    assert float((pans.centres - CENTRE.float()).abs().max()) < 1e-6
+    assert float((pans.centers - CENTER.float()).abs().max()) < 1e-6
     for direction in (offset, pans.c2w[:, :3, 2]):
         turn = torch.atan2(direction[:, 1], direction[:, 0]).rad2deg()
         assert turn.min() == pytest.approx(0, abs=1) and turn.max() == pytest.approx(150 * 23 / 24, abs=1)
@@ -95,8 +95,8 @@ def test_make_orbit_path_of_arc_and_half_pan_swings():
 @pytest.mark.parametrize(("degrees", "outermost", "innermost"), [(150, 50, 25), (360, 60, 25)])
 def test_make_spiral_path_of_ring_winds_in(degrees: float, outermost: float, innermost: float):
     orbit = make_orbit(ring_poses(24, degrees=degrees), 60)
-    offset = make_spiral_path(orbit, 60).centres - CENTRE.float()
-    middle = normalize(orbit.centres.mean(0) - CENTRE.float(), dim=0)
+    offset = make_spiral_path(orbit, 60).centers - CENTER.float()
+    middle = normalize(orbit.centers.mean(0) - CENTER.float(), dim=0)
     torch.testing.assert_close(offset.norm(dim=1), torch.full((60,), RADIUS), atol=0.05, rtol=0)
     away = torch.acos(normalize(offset, dim=1) @ middle).rad2deg()
     assert away[:8].max() > outermost and away[25:36].max() < innermost

@@ -33,9 +33,9 @@ def test_look_at_of_target_points_forward_axis_at_it(batch, up):
 
 @pytest.mark.parametrize(("up", "elevation"), [(UPS[0], -0.4), (UPS[3], 1.3)])
 def test_make_circle_poses_is_a_level_circle(up, elevation):
-    up, centre, radius, frames = unit(*up), torch.randn(3).double(), 2.5, 7
-    c2w = make_circle_poses(centre, up, radius, elevation, frames)
-    offset = c2w[:, :3, 3] - centre
+    up, center, radius, frames = unit(*up), torch.randn(3).double(), 2.5, 7
+    c2w = make_circle_poses(center, up, radius, elevation, frames)
+    offset = c2w[:, :3, 3] - center
     assert c2w.shape == (frames, 4, 4)
     torch.testing.assert_close(offset.norm(dim=-1), torch.full((frames,), radius).double())
     torch.testing.assert_close(torch.asin(offset @ up / radius), torch.full((frames,), elevation).double())

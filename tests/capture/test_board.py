@@ -27,12 +27,12 @@ def printed(board: Board, legacy: bool = False) -> np.ndarray:
 
 
 def photo(print_: np.ndarray, board: Board, c2w: np.ndarray) -> np.ndarray:
-    """Photo of the print without distortion; x right and y up from its centre."""
+    """Photo of the print without distortion; x right and y up from its center."""
     w2c = invert_pose(c2w)
     height, width = print_.shape
     step = board.square / CELL
     to_world = np.array([[step, 0, -step * width / 2], [0, -step, step * height / 2], [0, 0, 1]])
-    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
+    half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centers are integers
     H = np.linalg.inv(half) @ LENS.K @ w2c[:3][:, [0, 1, 3]] @ to_world @ half
     # Drawn large and averaged down, so that edges are smooth.
     grown = np.diag([4.0, 4.0, 1.0])
@@ -68,7 +68,7 @@ def test_make_board_detector_finds_corners_where_they_project(legacy: bool):
 def test_calibrate_with_board_finds_lens_and_poses():
     detect, c2ws = make_board_detector(FAMILY, TAG, BOARD), eyes(8)
     photos = [photo(printed(BOARD), BOARD, c2w) for c2w in c2ws]
-    seen = [PhotoObservation(Path(f"{i}.png"), LENS.width, LENS.height, detect(grey)) for i, grey in enumerate(photos)]
+    seen = [PhotoObservation(Path(f"{i}.png"), LENS.width, LENS.height, detect(gray)) for i, gray in enumerate(photos)]
     found = calibrate(Path("board"), seen, None)
     assert abs(found.lens.fx / LENS.fx - 1) < 0.003 and found.rms < 0.2
     for w2c, c2w in zip(found.solution.w2c.values(), c2ws, strict=True):

@@ -18,7 +18,7 @@ from tests.helpers.tag_views import LENS, SIX_TAGS, TAG_SIZE, make_observations,
 
 
 def bundle(photos: int = 8, noise: float = 0.0, tag_shift: float = 0.0, seed: int = 0) -> Bundle:
-    """The true bundle, or one perturbed by `tag_shift` radians and centimetres."""
+    """The true bundle, or one perturbed by `tag_shift` radians and centimeters."""
     rng = np.random.default_rng(seed)
     c2w = make_poses(photos, seed)
     seen = make_observations(SIX_TAGS, c2w, noise=noise, seed=seed)

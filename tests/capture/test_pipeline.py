@@ -62,15 +62,15 @@ def test_capture_scene_writes_scene_with_subject_in_box(packed: tuple[Path, Capt
     low, high = scene.bounds.aabb
     assert (low < subject.amin(0)).all() and (subject.amax(0) < high).all()
     assert (high - low).max() < 4 * (corners[1] - corners[0]).max()
-    distances = (scene.train.cameras.centres - scene.bounds.centre).norm(dim=1)
+    distances = (scene.train.cameras.centers - scene.bounds.center).norm(dim=1)
     assert 0 < scene.bounds.near < float(distances.min())
-    assert (scene.orbit.centres[:, 2] > 0).all()  # above the paper, at the cameras' distance
-    of_orbit = (scene.orbit.centres - scene.bounds.centre).norm(dim=1)
+    assert (scene.orbit.centers[:, 2] > 0).all()  # above the paper, at the cameras' distance
+    of_orbit = (scene.orbit.centers - scene.bounds.center).norm(dim=1)
     assert 0.8 * distances.min() < of_orbit.min() and of_orbit.max() < 1.2 * distances.max()
 
 
 def test_detect_tags_corners_have_no_offset(tag_capture: tuple[Path, Truth]):
-    """Pixel centres at +0.5: the mean of all corner errors vanishes."""
+    """Pixel centers at +0.5: the mean of all corner errors vanishes."""
     folder, truth = tag_capture
     found = detect_tags(find_photos(folder / "calibration", "calibration"), make_tag_detector("DICT_4X4_50", TAG_SIZE))
     errors = [
@@ -96,9 +96,9 @@ def test_detect_tags_in_rotated_photos_turns_them_upright(tag_capture: tuple[Pat
 
 def test_guess_dictionary_finds_the_printed_one(tag_capture: tuple[Path, Truth], tmp_path: Path):
     assert guess_dictionary(find_photos(tag_capture[0] / "calibration", "calibration")) == "DICT_4X4_50"
-    imageio.imwrite(tmp_path / "grey.png", np.full((100, 120, 3), 128, np.uint8))
+    imageio.imwrite(tmp_path / "gray.png", np.full((100, 120, 3), 128, np.uint8))
     with pytest.raises(InputError, match="no tag"):
-        guess_dictionary([tmp_path / "grey.png"])
+        guess_dictionary([tmp_path / "gray.png"])
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +151,7 @@ def test_capture_with_bad_photo_names_it(few_photos: dict[str, Path], tmp_path: 
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_read_layout_gives_corners_in_metres_or_names_file(tmp_path: Path):
+def test_read_layout_gives_corners_in_meters_or_names_file(tmp_path: Path):
     file = tmp_path / "sheet.yaml"
     file.write_text("tags: {0: {x: 0.0, y: 0.0}, 3: {x: 0.09, y: -0.02, turn: 90}}")
     layout = read_layout(file, "DICT_4X4_50", TAG_SIZE)

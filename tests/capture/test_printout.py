@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from nerf_lightning.capture.tags.detect import make_tag_detector
-from nerf_lightning.capture.tags.printout import A4_METRES, draw_sheet, write_sheet_pdf
+from nerf_lightning.capture.tags.printout import A4_METERS, draw_sheet, write_sheet_pdf
 from nerf_lightning.capture.tags.tag_layout import TagLayout, flat_pose, read_layout
 from nerf_lightning.cli.capture import print_tags
 from nerf_lightning.drawing.style import rasterize_figure
@@ -22,10 +22,10 @@ from nerf_lightning.errors import InputError
 def test_draw_sheet_of_layout_shows_tags_at_their_positions(layout: TagLayout):
     image = cv2.cvtColor(rasterize_figure(draw_sheet(layout)), cv2.COLOR_RGB2GRAY)
     height, width = image.shape
-    assert width / height == pytest.approx(A4_METRES[0] / A4_METRES[1], rel=0.01)
+    assert width / height == pytest.approx(A4_METERS[0] / A4_METERS[1], rel=0.01)
     found = make_tag_detector(layout.dictionary, layout.size)(image)
     assert sorted(found) == sorted(layout.poses)
-    scale = width / A4_METRES[0]
+    scale = width / A4_METERS[0]
     corners = {tag: layout.corners(tag)[:, :2] * [1, -1] * scale for tag in layout.poses}
     every = np.concatenate(list(corners.values()))
     shift = [width / 2, height / 2] - (every.min(0) + every.max(0)) / 2

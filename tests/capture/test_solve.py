@@ -17,7 +17,7 @@ FOLDER = Path("calibration")
 
 
 def max_tag_error(tags: dict[int, np.ndarray], reference: int) -> float:
-    """Largest position error of a tag in the frame of the reference tag, metres."""
+    """Largest position error of a tag in the frame of the reference tag, meters."""
     home = invert_pose(SIX_TAGS.poses[reference])
     return max(float(np.linalg.norm((home @ SIX_TAGS.poses[tag])[:3, 3] - pose[:3, 3])) for tag, pose in tags.items())
 

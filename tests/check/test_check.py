@@ -22,7 +22,7 @@ Edit = Callable[[np.ndarray], np.ndarray]
 
 @pytest.fixture(scope="module")
 def views() -> Views:
-    """A pile on grey grain."""
+    """A pile on gray grain."""
     cameras = make_hemisphere_cameras(16, 96)
     images = render_photos(PILE, cameras, (0.5, 0.5, 0.5)).numpy().astype(np.int16)
     noise = cv2.GaussianBlur(np.random.default_rng(0).normal(0, 60, (96, 96)), (0, 0), 1.0)

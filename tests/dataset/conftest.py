@@ -1,4 +1,4 @@
-"""A small scene in every format: a coloured ball off the origin, exact silhouettes, rectangular images."""
+"""A small scene in every format: a colored ball off the origin, exact silhouettes, rectangular images."""
 
 import math
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import torch
 from nerf_lightning.cameras import Bounds, Cameras, make_circle_poses
 from nerf_lightning.dataset import Scene, Views
 
-CENTRE = torch.tensor([0.3, -0.2, 0.1])
+CENTER = torch.tensor([0.3, -0.2, 0.1])
 RADIUS = 0.5
 WIDTH, HEIGHT, FOCAL = 48, 40, 60.0
 
@@ -25,11 +25,11 @@ def ball_views(per_ring: int, elevations: tuple[float, ...] = (-0.6, 0.2, 0.9), 
     images = []
     for view in range(len(c2w)):
         rays = cameras.generate_view_rays(view)
-        to_ball = CENTRE - rays.origins
+        to_ball = CENTER - rays.origins
         along = (to_ball * rays.directions).sum(-1)
         under = RADIUS**2 - (to_ball.square().sum(-1) - along**2)
         hit = rays.origins + (along - under.clamp_min(0).sqrt())[:, None] * rays.directions
-        rgb = ((hit - CENTRE) / RADIUS * 0.5 + 0.5).clamp(0, 1) * 0.8 + 0.2
+        rgb = ((hit - CENTER) / RADIUS * 0.5 + 0.5).clamp(0, 1) * 0.8 + 0.2
         rgba = torch.cat([rgb, torch.ones_like(along)[:, None]], dim=-1) * (under > 0)[:, None]
         images.append((rgba * 255).round().to(torch.uint8).view(HEIGHT, WIDTH, 4))
     return Views.from_images(torch.stack(images), cameras)
@@ -42,7 +42,7 @@ def ball_views_of() -> Callable[..., Views]:
 
 @pytest.fixture(scope="session")
 def ball_box() -> torch.Tensor:
-    return torch.stack([CENTRE - RADIUS, CENTRE + RADIUS])
+    return torch.stack([CENTER - RADIUS, CENTER + RADIUS])
 
 
 @pytest.fixture(scope="session")

@@ -85,7 +85,7 @@ def rays_of(intrinsics: Intrinsics, uv: np.ndarray) -> np.ndarray:
 
 
 def test_open_scene_points_and_depths_decide_near(views: Views, tmp_path: Path):
-    """Photos on grey noise, so that the scene is unbounded; cameras are 4 units from the centre."""
+    """Photos on gray noise, so that the scene is unbounded; cameras are 4 units from the center."""
     rng = np.random.default_rng(0)
     noise = torch.from_numpy(rng.integers(0, 255, (*views.images.shape[:3], 3), np.uint8))
     names = write_photos(tmp_path / "images", Views.from_images(noise, views.cameras))
@@ -98,7 +98,7 @@ def test_open_scene_points_and_depths_decide_near(views: Views, tmp_path: Path):
 
     middle = rng.normal(0, 0.1, (300, 3))
     assert near(middle) == near(np.zeros((0, 3))) == pytest.approx(0.25, abs=0.01)
-    ahead = views.cameras.centres[2].numpy() + 0.2 * views.cameras.c2w[2, :3, 2].numpy()
+    ahead = views.cameras.centers[2].numpy() + 0.2 * views.cameras.c2w[2, :3, 2].numpy()
     assert near(np.concatenate([middle, ahead + 0.01 * middle])) == pytest.approx(0.7 * 0.2 / 4, rel=0.1)
 
 
@@ -134,7 +134,7 @@ def test_open_scene_colmap_variant_matches_the_plain_folder(variant: str, views:
     write_colmap(tmp_path / "s" / model, views.cameras.c2w.numpy(), names, colmap_cameras(views), text=True)
     scene = open_scene(str(tmp_path / "s"))
     assert scene.name == "s" and len(scene.train) == len(expected.train)
-    torch.testing.assert_close(scene.train.cameras.centres.sort(0)[0], expected.train.cameras.centres.sort(0)[0])
+    torch.testing.assert_close(scene.train.cameras.centers.sort(0)[0], expected.train.cameras.centers.sort(0)[0])
     factor = 4 if folder == "images_4" else 1
     assert float(scene.train.cameras.K[0, 0, 0]) == pytest.approx(float(expected.train.cameras.K[0, 0, 0]) / factor)
     if factor == 1 and "spaces" not in variant:

@@ -11,7 +11,7 @@ SIZES = [(40, 20), (16, 16), (7, 33)]
 
 
 def make_views(masked: bool = False) -> Views:
-    """Three sizes; each pixel's index is its colour."""
+    """Three sizes; each pixel's index is its color."""
     sizes = torch.tensor(SIZES)
     count = int(sizes.prod(1).sum())
     numbers = torch.arange(count)

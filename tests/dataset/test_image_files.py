@@ -59,7 +59,7 @@ def test_read_pixels_damaged_image_raises(tmp_path: Path):
 
 
 @pytest.mark.parametrize("mode", ["L", "CMYK"])
-def test_read_pixels_grey_and_cmyk_become_rgb(mode: str, tmp_path: Path):
+def test_read_pixels_gray_and_cmyk_become_rgb(mode: str, tmp_path: Path):
     picture = Image.fromarray(photo(32, 16)).convert(mode)
     picture.save(tmp_path / "a.jpg", quality=95)
     assert np.abs(read_pixels(tmp_path / "a.jpg").astype(int) - np.asarray(picture.convert("RGB"))).mean() < 4

@@ -23,7 +23,7 @@ def views(ball_views_of: Callable[..., Views]) -> Views:
 
 
 def mixed() -> Views:
-    """Three sizes; each pixel has a unique colour."""
+    """Three sizes; each pixel has a unique color."""
     sizes = torch.tensor([[4, 3], [2, 5], [7, 1]])
     K = torch.eye(3).repeat(3, 1, 1)
     K[:, :2, 2] = sizes / 2
@@ -65,7 +65,7 @@ def test_ray_data_held_out_masked_view_has_valid_mask():
 
 
 def capture(folder: Path, views: Views, background: int | None = None) -> Path:
-    """A COLMAP capture whose photos are RGB on grey noise, or on one grey."""
+    """A COLMAP capture whose photos are RGB on gray noise, or on one gray."""
     rng = np.random.default_rng(0)
     rgb = []
     for i in range(len(views)):

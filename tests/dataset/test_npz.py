@@ -49,7 +49,7 @@ def test_load_npz_plain_file_returns_its_arrays(arrays: Arrays, path: Path):
     torch.testing.assert_close(scene.train.cameras.K[1], torch.tensor([[10.0, 0, 4], [0, 10, 3], [0, 0, 1]]))
     cameras = scene.train.cameras
     region = find_region(cameras.c2w)
-    torch.testing.assert_close(scene.orbit.c2w, make_orbit_path(cameras, region.layout, region.centre).c2w)
+    torch.testing.assert_close(scene.orbit.c2w, make_orbit_path(cameras, region.layout, region.center).c2w)
     assert torch.equal(scene.to_source, torch.eye(4))
 
 

@@ -24,7 +24,7 @@ def red_then_blue() -> np.ndarray:
 
 
 def write(path: Path, picture: np.ndarray) -> Path:
-    """Any depth; grey, grey and alpha (8 bits), RGB or RGBA."""
+    """Any depth; gray, gray and alpha (8 bits), RGB or RGBA."""
     if picture.shape[-1] == 2:
         imageio.imwrite(path, picture)
     else:
@@ -59,15 +59,15 @@ def test_load_picture_exif_orientation_is_applied(
 RAMP = np.arange(256, dtype=np.uint16).reshape(16, 16, 1)
 NONE, FULL, WHITE_UNDER = RAMP * 0, RAMP * 0 + 255, 255 - RAMP
 KINDS = {
-    "grey": ([RAMP], [RAMP] * 3),
+    "gray": ([RAMP], [RAMP] * 3),
     "rgb": ([RAMP, RAMP[::-1], NONE], [RAMP, RAMP[::-1], NONE]),
-    "grey and alpha": ([NONE, RAMP], [WHITE_UNDER] * 3),
+    "gray and alpha": ([NONE, RAMP], [WHITE_UNDER] * 3),
     "rgba": ([FULL, NONE, NONE, RAMP], [FULL, WHITE_UNDER, WHITE_UNDER]),
 }
 
 
 @pytest.mark.parametrize(
-    ("kind", "bits"), [(kind, bits) for kind in KINDS for bits in (8, 16) if (kind, bits) != ("grey and alpha", 16)]
+    ("kind", "bits"), [(kind, bits) for kind in KINDS for bits in (8, 16) if (kind, bits) != ("gray and alpha", 16)]
 )
 def test_load_picture_png_kinds_become_rgb8(kind: str, bits: int, tmp_path: Path):
     """Any depth and channel count becomes 8-bit RGB; alpha lies over white."""
@@ -86,7 +86,7 @@ def test_builtin_picture_is_deterministic_and_detailed():
     picture = make_builtin_picture(128)
     assert picture.shape == (128, 128, 3) and picture.dtype == torch.uint8
     assert torch.equal(picture, make_builtin_picture(128))
-    assert (picture.float().std((0, 1)) > 20).all(), "colourful in every channel"
+    assert (picture.float().std((0, 1)) > 20).all(), "colorful in every channel"
 
 
 def test_load_picture_changed_png_raises(tmp_path: Path):

@@ -13,7 +13,7 @@ HEIGHT, WIDTH = 4, 7
 
 @pytest.fixture
 def picture() -> Picture:
-    """Each pixel's colour encodes its position: (row, column, 255)."""
+    """Each pixel's color encodes its position: (row, column, 255)."""
     row, col = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
     return Picture("labels", "test", torch.stack([row, col, torch.full_like(row, 255)], dim=-1).to(torch.uint8))
 

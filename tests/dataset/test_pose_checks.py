@@ -40,7 +40,7 @@ def cameras_at(c2w: np.ndarray, focal: float = FOCAL, width: int = SIZE, height:
 
 
 def matches_of(c2w: np.ndarray, spread: float) -> Matches:
-    """Exact matches of neighbours: points around the origin, or surrounding the cameras."""
+    """Exact matches of neighbors: points around the origin, or surrounding the cameras."""
     points = torch.from_numpy(np.random.default_rng(0).normal(size=(4000, 3)) * spread).float()
     cameras = cameras_at(c2w)
     seen = [cameras.project(points, view) for view in range(len(c2w))]
@@ -54,14 +54,14 @@ def matches_of(c2w: np.ndarray, spread: float) -> Matches:
 
 
 def change_parts(
-    rotation: Callable | None = None, centre: Callable | None = None
+    rotation: Callable | None = None, center: Callable | None = None
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Changes the rotations, and replaces the centres by a function of the poses."""
+    """Changes the rotations, and replaces the centers by a function of the poses."""
 
     def apply(c2w: np.ndarray) -> np.ndarray:
         moved = c2w.copy()
         moved[:, :3, :3] = c2w[:, :3, :3] if rotation is None else rotation(c2w[:, :3, :3])
-        moved[:, :3, 3] = c2w[:, :3, 3] if centre is None else centre(c2w)
+        moved[:, :3, 3] = c2w[:, :3, 3] if center is None else center(c2w)
         return moved
 
     return apply
@@ -78,11 +78,11 @@ MISTAKES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "world-to-camera matrices instead": np.linalg.inv,
     "world-to-camera matrices": lambda c2w: np.linalg.inv(c2w @ GL),
     "transposed rotations": change_parts(lambda R: R.transpose(0, 2, 1)),
-    "world-to-camera translations": change_parts(centre=lambda c2w: np.linalg.inv(c2w)[:, :3, 3]),
+    "world-to-camera translations": change_parts(center=lambda c2w: np.linalg.inv(c2w)[:, :3, 3]),
     "photos that are rotated by 90 or 180 degrees": change_parts(lambda R: R @ SIDEWAYS),
     "a mirrored world": lambda c2w: MIRROR @ c2w @ MIRROR,
     "quaternions in another order": change_parts(roll_quaternions),
-    "centres and rotations in different world frames": change_parts(centre=lambda c2w: c2w[:, :3, 3] @ OTHER_UP),
+    "centers and rotations in different world frames": change_parts(center=lambda c2w: c2w[:, :3, 3] @ OTHER_UP),
 }
 
 

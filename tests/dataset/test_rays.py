@@ -13,8 +13,8 @@ from nerf_lightning.renderer import composite_over
 VIEWS, HEIGHT, WIDTH = 3, 4, 6
 
 
-def make_labelled_views(count: int) -> Views:
-    """Each pixel's colour encodes its position: (view, row, column, 255)."""
+def make_labeled_views(count: int) -> Views:
+    """Each pixel's color encodes its position: (view, row, column, 255)."""
     view, row, col = torch.meshgrid(*(torch.arange(n) for n in (count, HEIGHT, WIDTH)), indexing="ij")
     images = torch.stack([view, row, col, torch.full_like(view, 255)], dim=-1).to(torch.uint8)
     c2w = make_circle_poses(torch.zeros(3), torch.tensor([0.0, 0, 1]), 4.0, 0.3, count)
@@ -25,7 +25,7 @@ def make_labelled_views(count: int) -> Views:
 
 @pytest.fixture
 def scene() -> Scene:
-    train, val = make_labelled_views(VIEWS), make_labelled_views(2)
+    train, val = make_labeled_views(VIEWS), make_labeled_views(2)
     return Scene("labels", "test", train, val, val.cameras, Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3])))
 
 
@@ -41,11 +41,11 @@ def test_make_batch_colors_match_rays(scene: Scene):
 
 
 def test_measure_texturelessness_step_and_slope_differ():
-    """A photo with a colour step and one with a ramp, of two sizes: only nearby pixels of the same photo count."""
+    """A photo with a color step and one with a ramp, of two sizes: only nearby pixels of the same photo count."""
     step, slope = torch.full((20, 160, 3), 90), torch.arange(80).expand(40, 80)[..., None].repeat(1, 1, 3)
     step[:, 100:, 1] = 120
     images = [x.to(torch.uint8) for x in (step, slope)]
-    cameras = make_labelled_views(2).cameras
+    cameras = make_labeled_views(2).cameras
     views = Views(
         torch.cat([image.flatten(0, 1) for image in images]),
         replace(cameras, sizes=torch.tensor([[160, 20], [80, 40]])),

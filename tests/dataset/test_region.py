@@ -15,22 +15,22 @@ from torch import Tensor
 from nerf_lightning.cameras import CameraLayout, Cameras
 from nerf_lightning.dataset import PhotoLoadOptions, Scene, Views, open_scene
 from nerf_lightning.dataset.region import PAN_DEPTH, find_region
-from tests.helpers.camera_paths import CENTRE, RADIUS, forward, pan, ring_poses, walk
+from tests.helpers.camera_paths import CENTER, RADIUS, forward, pan, ring_poses, walk
 from tests.helpers.scene_writers import colmap_cameras, write_colmap, write_photos, write_transforms
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 140.0
 
 
 def sample_box(low: tuple[float, ...], high: tuple[float, ...], count: int = 400) -> Float[Tensor, "P 3"]:
-    """Points in a box around `CENTRE`."""
+    """Points in a box around `CENTER`."""
     share = torch.rand(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return CENTRE + torch.tensor(low) + share * (torch.tensor(high) - torch.tensor(low))
+    return CENTER + torch.tensor(low) + share * (torch.tensor(high) - torch.tensor(low))
 
 
 def sample_sphere(radius: float) -> Float[Tensor, "P 3"]:
-    """Points on a sphere around `CENTRE`."""
+    """Points on a sphere around `CENTER`."""
     points = torch.randn(400, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return CENTRE + radius * points / points.norm(dim=1, keepdim=True)
+    return CENTER + radius * points / points.norm(dim=1, keepdim=True)
 
 
 def size_of(scene: Scene) -> float:
@@ -54,49 +54,49 @@ def write_folder(folder: Path, c2w: Float[Tensor, "V 4 4"], draw: Callable[[Came
 
 
 @pytest.mark.parametrize(("yaw", "distance"), [(0, 0.5), (10, 2.0), (20, 1.0)])
-def test_find_region_ring_is_centred_on_its_subject(yaw: int, distance: float):
+def test_find_region_ring_is_centered_on_its_subject(yaw: int, distance: float):
     radius = RADIUS * distance
     for elevation in (10.0, 25.0, 40.0):
         region = find_region(ring_poses(32, yaw, elevation, radius=radius))
         assert region.layout == CameraLayout.INWARD and region.has_depth
-        assert float((region.centre - CENTRE).norm()) < 0.1 * radius
+        assert float((region.center - CENTER).norm()) < 0.1 * radius
         assert region.unit == pytest.approx(radius, rel=0.05)
         shift = torch.tensor([449500.25, 5411200.75, 210.5], dtype=torch.float64)  # a georeferenced frame
         there = ring_poses(32, yaw, elevation, radius=radius)
         there[:, :3, 3] += shift
         far = find_region(there)
-        torch.testing.assert_close(far.centre - shift, region.centre, atol=1e-6, rtol=0)
+        torch.testing.assert_close(far.center - shift, region.center, atol=1e-6, rtol=0)
         assert far.layout == region.layout and far.unit == pytest.approx(region.unit)
 
 
-def test_find_region_arc_is_centred_by_points():
+def test_find_region_arc_is_centered_by_points():
     """A subject, and a wall behind it in few of the photos."""
     points = torch.cat([sample_box((-0.3, -0.3, -0.3), (0.3, 0.3, 0.3)), sample_box((-6, -6, -1), (-5, 6, 4))])
     region = find_region(ring_poses(24, 15, degrees=150), points)
-    assert float((region.centre - CENTRE).norm()) < 0.1 * RADIUS
+    assert float((region.center - CENTER).norm()) < 0.1 * RADIUS
     assert region.unit == pytest.approx(RADIUS, rel=0.1)
 
 
 @pytest.mark.parametrize("diverging", [-0.3, 0.2])
-def test_find_region_forward_is_centred_on_points(diverging: float):
+def test_find_region_forward_is_centered_on_points(diverging: float):
     region = find_region(forward(diverging), sample_box((2.5, -1, -0.7), (3.5, 1, 0.7)))
     assert region.has_subject
-    assert float((region.centre - CENTRE - torch.tensor([3.0, 0, 0])).norm()) < 0.4
+    assert float((region.center - CENTER - torch.tensor([3.0, 0, 0])).norm()) < 0.4
     assert region.unit == pytest.approx(3.0, rel=0.15)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_find_region_pan_is_centred_on_its_camera(noise: float):
+def test_find_region_pan_is_centered_on_its_camera(noise: float):
     region = find_region(pan(noise), sample_sphere(3.0))
     assert region.layout == CameraLayout.PAN and region.has_depth and not region.has_subject
-    assert float((region.centre - CENTRE).norm()) < noise + 1e-9
+    assert float((region.center - CENTER).norm()) < noise + 1e-9
     assert region.unit == pytest.approx(3.0 / PAN_DEPTH, rel=0.05)
 
 
 def test_find_region_walk_holds_its_cameras():
     c2w = walk()
     region = find_region(c2w, c2w[:, :3, 3] + 3 * c2w[:, :3, 2])
-    inside = ((c2w[:, :3, 3] - region.centre).abs() <= region.unit).all(1).double().mean()
+    inside = ((c2w[:, :3, 3] - region.center).abs() <= region.unit).all(1).double().mean()
     assert region.layout == CameraLayout.WALK and region.has_depth and inside >= 0.8
     assert 2.5 < region.unit < 8.0
 
@@ -123,7 +123,7 @@ def render_inside_ball(cameras: Cameras, radius: float = 3.0) -> UInt8[Tensor, "
 )
 def test_open_scene_without_depth_matches_photos(c2w: torch.Tensor, layout: CameraLayout, tmp_path: Path):
     c2w = c2w.clone()
-    c2w[:, :3, 3] -= CENTRE
+    c2w[:, :3, 3] -= CENTER
     scene = open_scene(str(write_folder(tmp_path, c2w, render_inside_ball)), options=PhotoLoadOptions(holdout=8))
     assert size_of(scene) * (PAN_DEPTH if layout == CameraLayout.PAN else 1) == pytest.approx(3, rel=0.2)
     assert scene.points is not None and len(scene.points) > 50
@@ -137,7 +137,7 @@ def test_open_scene_pan_unknown_depth_warns(noise: float, tmp_path: Path, caplog
         scene = open_scene(str(write_folder(tmp_path, pan(noise))))
     assert ("determine the depth" in caplog.text) == (noise > 0)
     assert scene.bounds.unbounded and scene.bounds.near is None
-    assert float((scene.to_source[:3, 3].double() - CENTRE).norm()) < 0.05
+    assert float((scene.to_source[:3, 3].double() - CENTER).norm()) < 0.05
 
 
 def test_open_scene_colmap_points_are_in_the_scenes_frame(tmp_path: Path):

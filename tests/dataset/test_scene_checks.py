@@ -145,7 +145,7 @@ def test_find_border_color_is_the_background(pile: Scene, tmp_path: Path):
 def test_check_bounds_box_off_the_subject_warns(pile: Scene):
     aside = replace(pile.bounds, aabb=pile.bounds.aabb + torch.tensor([3.0, 0, 0]))
     (text,) = (issue.text for issue in check_bounds(replace(pile, bounds=aside)))
-    assert "cameras look at a point 3 from the box centre" in text
+    assert "cameras look at a point 3 from the box center" in text
     tiny = replace(pile.bounds, aabb=0.1 * pile.bounds.aabb, unbounded=True)
     (text,) = (issue.text for issue in check_bounds(replace(pile, bounds=tiny)))
     assert "half-sizes" in text

@@ -45,7 +45,7 @@ def with_margin(views: Views) -> Views:
 
 SHOWN: dict[str, tuple[Callable[[Views], Views], bool, int, str]] = {
     "cut out": (lambda views: views, True, 4, "alpha cuts the subject out"),
-    "on grey": (lambda views: on_color(views, 90), True, 3, "borders have one colour"),
+    "on gray": (lambda views: on_color(views, 90), True, 3, "borders have one color"),
     "background": (lambda views: with_background(views, None), False, 3, "show a background"),
     "opaque alpha": (lambda views: with_background(views, 255), False, 3, "show a background"),
     "margins": (with_margin, False, 3, "show a background"),
@@ -61,7 +61,7 @@ def test_open_scene_kind_is_the_same_in_every_format(shown: str, format: str, ba
     scene = open_scene(str(write_scene(format, tmp_path / "s", edit(ball_views))))
     assert scene.bounds.unbounded is not bounded and scene.train.channels == channels
     assert reason in scene.describe()["kind"] and scene.describe()["bounded"] is bounded
-    if shown == "on grey":
+    if shown == "on gray":
         assert scene.background == pytest.approx((90 / 255,) * 3)
     if shown == "margins":
         assert not scene.train.view_mask(0)[0].any() and scene.train.view_mask(0)[1:-1, 1:-1].all()
@@ -71,7 +71,7 @@ def test_open_scene_kind_is_the_same_in_every_format(shown: str, format: str, ba
 def test_open_scene_frame_is_the_same_in_every_format(format: str, ball_views: Views, tmp_path: Path):
     views = with_background(ball_views, None)
     scene = open_scene(str(write_scene(format, tmp_path / "s", views)))
-    assert float(scene.train.cameras.centres.norm(dim=1).median()) == pytest.approx(1, rel=0.02)
+    assert float(scene.train.cameras.centers.norm(dim=1).median()) == pytest.approx(1, rel=0.02)
     torch.testing.assert_close(scene.bounds.aabb, torch.tensor([[-1.0] * 3, [1.0] * 3]))
     first = 3 if format in ("npz", "blender") else 1
     back = transform_poses(scene.train.cameras.c2w[:1], scene.to_source)[0].float()

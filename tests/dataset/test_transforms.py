@@ -25,7 +25,7 @@ def opengl_pose(angle: float) -> np.ndarray:
 
 
 def project_point(pose: np.ndarray, intrinsics: dict, point: np.ndarray) -> np.ndarray:
-    """Projects a world point, in OpenCV's indices (pixel centres are integers)."""
+    """Projects a world point, in OpenCV's indices (pixel centers are integers)."""
     local = pose[:3, :3].T @ (point - pose[:3, 3])
     K = np.array(
         [[intrinsics["fl_x"], 0, intrinsics["cx"] - 0.5], [0, intrinsics["fl_y"], intrinsics["cy"] - 0.5], [0, 0, 1]]
@@ -37,7 +37,7 @@ def project_point(pose: np.ndarray, intrinsics: dict, point: np.ndarray) -> np.n
 
 
 def dot(at: np.ndarray) -> np.ndarray:
-    """A soft bright dot on black, centred on an OpenCV index."""
+    """A soft bright dot on black, centered on an OpenCV index."""
     x, y = np.meshgrid(np.arange(W), np.arange(H))
     value = np.rint(250 * np.exp(-((x - at[0]) ** 2 + (y - at[1]) ** 2) / (2 * 2.5**2))).astype(np.uint8)
     return np.repeat(value[..., None], 3, axis=2)

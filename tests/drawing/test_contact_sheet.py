@@ -1,7 +1,7 @@
 import numpy as np
 
 from nerf_lightning.drawing.contact_sheet import GAP_PX, make_contact_sheet
-from nerf_lightning.drawing.style import VERMILLION, parse_hex_colour
+from nerf_lightning.drawing.style import VERMILLION, parse_hex_color
 
 
 def flat(height: int, width: int, level: int) -> np.ndarray:
@@ -26,11 +26,11 @@ def test_make_contact_sheet_lays_out_images_row_by_row():
     assert below[:, : GAP_PX + cell].min() < 100 and below[:, GAP_PX + cell :].min() < 100, "captions below both"
 
 
-def test_make_contact_sheet_outlines_flagged_and_greys_missing_images():
+def test_make_contact_sheet_outlines_flagged_and_grays_missing_images():
     sheet = make_contact_sheet([flat(30, 40, 40), None], ["good", "lost"], columns=2, width=300, flagged=[1])
     cell = (300 - GAP_PX) // 2 - GAP_PX
     assert (sheet[GAP_PX + 20, 2 * GAP_PX + cell + 20] == 221).all()
-    marked = np.argwhere((sheet == parse_hex_colour(VERMILLION)).all(-1))
+    marked = np.argwhere((sheet == parse_hex_color(VERMILLION)).all(-1))
     assert marked[:, 1].min() == 2 * GAP_PX + cell - 4, "around the second alone"
 
 

@@ -28,9 +28,9 @@ def test_amplitude_spectrum_of_wave_peaks_at_its_frequency(across: int, down: in
 
 def test_amplitude_spectrum_power_sums_to_variance():
     height, width = 33, 17
-    grey = np.random.default_rng(0).normal(size=(height, width))
+    gray = np.random.default_rng(0).normal(size=(height, width))
     window = np.outer(*(np.sin(np.pi * np.arange(1, n + 1) / (n + 1)) ** 2 for n in (height, width)))
-    assert (amplitude_spectrum(grey) ** 2).sum() == pytest.approx((grey**2 * window**2).sum() / (window**2).sum())
+    assert (amplitude_spectrum(gray) ** 2).sum() == pytest.approx((gray**2 * window**2).sum() / (window**2).sum())
 
 
 @pytest.mark.parametrize("shape", [(64, 48, 3), (1, 1, 3)])

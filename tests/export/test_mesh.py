@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.mesh import build_mesh_file, build_points_file, build_voxels_file
 from nerf_lightning.export.volume import sample_volume
-from tests.helpers.ball_runs import CENTRE, MAX_DENSITY, RADIUS, make_ball_run
+from tests.helpers.ball_runs import CENTER, MAX_DENSITY, RADIUS, make_ball_run
 
 UTM = torch.tensor([5e5, 5.4112e6, 300.0], dtype=torch.float64)
-"""Metres, as georeferenced files have coordinates."""
+"""Meters, as georeferenced files have coordinates."""
 SCALE, SHIFT = 0.02, torch.tensor([5.0, -1.0, 2.0])
 TURN = torch.tensor([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 RESOLUTION = 40
@@ -50,11 +50,11 @@ def test_build_mesh_file_is_in_source_frame(suffix: str):
     if suffix == ".glb":
         vertices = lay_down(vertices)
     cell = SCALE * 2 / RESOLUTION
-    radius = np.linalg.norm(vertices - there(CENTRE), axis=1)
+    radius = np.linalg.norm(vertices - there(CENTER), axis=1)
     assert np.percentile(np.abs(radius - SCALE * RADIUS), 95) < 1.5 * cell
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * (SCALE * RADIUS) ** 3, rel=0.2)
     if suffix == ".stl":
-        return  # the format has no colours
+        return  # the format has no colors
     red, blue = mesh.visual.vertex_colors[:, 0], mesh.visual.vertex_colors[:, 2]
     height = (vertices @ TURN.numpy())[:, 2]
     top, bottom = height.argmax(), height.argmin()
@@ -76,7 +76,7 @@ def read_vertices(suffix: str, shift: torch.Tensor) -> np.ndarray:
 
 @pytest.mark.parametrize("suffix", [".ply", "points", ".obj", ".glb"])
 def test_build_mesh_file_georeferenced_vertices_keep_precision(suffix: str):
-    """In UTM coordinates single precision would leave steps of half a metre."""
+    """In UTM coordinates single precision would leave steps of half a meter."""
     near, far = read_vertices(".ply", torch.zeros(3)), read_vertices(suffix, UTM)
     far = (lay_down(far) if suffix == ".glb" else far) - UTM.numpy()
     size = np.ptp(near, axis=0).max()
@@ -99,21 +99,21 @@ def test_sample_volume_georeferenced_box_crops_cells():
     assert near.density.shape == (40, 33, 27), "the box, in cells of the scene"
 
 
-def test_build_voxels_file_contains_density_colour_and_transform():
+def test_build_voxels_file_contains_density_color_and_transform():
     run = make_ball_run(to_source())
     with np.load(io.BytesIO(build_voxels_file(run, sample_volume(run, RESOLUTION)).content)) as file:
         density, rgb, place = file["density"], file["rgb"], file["to_source"]
     assert density.shape == (RESOLUTION,) * 3 and rgb.shape == (*density.shape, 3)
     index = np.argwhere(density * SCALE > MAX_DENSITY / 2)
     places = index @ place[:3, :3].T + place[:3, 3]
-    np.testing.assert_allclose(places.mean(0), there(CENTRE), atol=SCALE * 0.01)
-    assert np.linalg.norm(places - there(CENTRE), axis=1).max() < SCALE * (RADIUS + 0.01)
+    np.testing.assert_allclose(places.mean(0), there(CENTER), atol=SCALE * 0.01)
+    assert np.linalg.norm(places - there(CENTER), axis=1).max() < SCALE * (RADIUS + 0.01)
     assert density.max() * SCALE == pytest.approx(MAX_DENSITY, rel=0.01), "per unit of the photos' frame"
 
 
 def test_sample_volume_box_has_finer_cells():
     run = make_ball_run(to_source())
-    middle = there(CENTRE)
+    middle = there(CENTER)
     reach = 0.7 * SCALE
     box = torch.tensor(np.stack([middle - reach, middle + [reach, reach, 0]]), dtype=torch.float32)
     volume = sample_volume(run, RESOLUTION, box)

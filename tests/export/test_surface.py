@@ -13,7 +13,7 @@ from nerf_lightning.export.surface import (
     find_unoccluded_cells,
 )
 from nerf_lightning.export.volume import Volume, sample_volume
-from tests.helpers.ball_runs import CENTRE, RADIUS, make_ball_run
+from tests.helpers.ball_runs import CENTER, RADIUS, make_ball_run
 
 N, CELL, SOFT, DENSE = 40, 0.05, 0.02, 60.0
 LIT = np.ones((N, N, N), bool)
@@ -21,10 +21,10 @@ LOW = torch.tensor([-1.0, -1.0, -1.0])
 
 
 def volume(*balls: tuple[tuple[float, float, float], float]) -> Volume:
-    """Balls (centre, radius) that are dense, softly at their skin."""
+    """Balls (center, radius) that are dense, softly at their skin."""
     empty = Volume(torch.zeros(N, N, N), LOW, CELL)
     depth = torch.stack(
-        [radius - (empty.centres - torch.tensor(centre)).norm(dim=-1) for centre, radius in balls]
+        [radius - (empty.centers - torch.tensor(center)).norm(dim=-1) for center, radius in balls]
     ).amax(0)
     density = DENSE * torch.sigmoid(depth / SOFT)
     return Volume(density, LOW, CELL)
@@ -79,13 +79,13 @@ def test_extract_surface_occluded_cells_are_solid():
     run = make_ball_run(torch.eye(4))
     one = sample_volume(run, N)
     unoccluded = find_unoccluded_cells(run.system, one, run.orbit)
-    radius = (one.centres - CENTRE).norm(dim=-1).numpy()
+    radius = (one.centers - CENTER).norm(dim=-1).numpy()
     assert not unoccluded[radius < RADIUS - 2.5 * one.cell].any()
     in_view = unoccluded[(radius > RADIUS + 2 * one.cell) & (radius < RADIUS + 4 * one.cell)]
     assert in_view.mean() > 0.95
     hollow = Volume(torch.where(torch.from_numpy(radius) < RADIUS - 3 * one.cell, 0.0, one.density), one.low, one.cell)
     inside = extract_surface(hollow, unoccluded, 0.5)
-    away = np.linalg.norm(inside.vertices - CENTRE.numpy(), axis=1)
+    away = np.linalg.norm(inside.vertices - CENTER.numpy(), axis=1)
     assert (away > RADIUS - one.cell).all(), "its inner side stays unseen"
 
 

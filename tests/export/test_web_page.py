@@ -23,7 +23,7 @@ from nerf_lightning.config.build import build_system
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.export.bake import bake_voxels
 from nerf_lightning.export.web_page import SCRIPTS, render_field_page, render_gallery_page, render_image_page
-from nerf_lightning.runs.compact import decode, encode, strip_local_paths
+from nerf_lightning.runs.compact import decode_run, encode_system, strip_local_paths
 from nerf_lightning.runs.folder import LoadedRun, config_to_dict
 from nerf_lightning.runs.scene_file import parse_metadata
 from nerf_lightning.system import NeRF3D
@@ -66,11 +66,11 @@ def made(recipe: str, precision: str = "byte", unbounded: bool = False) -> bytes
     system.sampler.import_state({"grid.occupied": torch.rand(16**3) < 0.3})
     plain = config_to_dict(cfg)
     plain["dataset"]["path"] = "/home/somebody/photos"
-    return strip_local_paths(encode(system, precision, plain, scene))
+    return strip_local_paths(encode_system(system, precision, plain, scene))
 
 
 def page_of(compact: bytes, name: str = "made") -> tuple[str, LoadedRun]:
-    run = decode(compact, "made")
+    run = decode_run(compact, "made")
     assert isinstance(run.system, NeRF3D) and run.orbit is not None
     return render_field_page(compact, run.system, run.orbit, name, [("note", name)], run.orbit, [name] * 4), run
 

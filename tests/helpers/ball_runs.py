@@ -1,4 +1,4 @@
-"""A field whose surface is known: a ball of a colour that depends on where one looks from."""
+"""A field whose surface is known: a ball of a color that depends on where one looks from."""
 
 from pathlib import Path
 
@@ -13,17 +13,17 @@ from nerf_lightning.runs.open import LoadedSceneRun
 from nerf_lightning.system import NeRF3D
 
 MAX_DENSITY = 80.0
-CENTRE, RADIUS, SHARPNESS = torch.tensor([0.1, -0.2, 0.05]), 0.6, 100.0
+CENTER, RADIUS, SHARPNESS = torch.tensor([0.1, -0.2, 0.05]), 0.6, 100.0
 
 
 class BallField(Field):
     """Density rises from outside to inside within a hundredth or two; red from above, blue from below."""
 
     def features(self, positions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        depth = RADIUS - (positions - CENTRE).norm(dim=1)
+        depth = RADIUS - (positions - CENTER).norm(dim=1)
         return MAX_DENSITY * torch.sigmoid(SHARPNESS * depth), positions
 
-    def colour(self, features: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
+    def color(self, features: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
         red = (1 - directions[:, 2]) / 2
         return torch.stack([red, torch.zeros_like(red), 1 - red], dim=1)
 
@@ -42,6 +42,6 @@ def make_ball_run(to_source: torch.Tensor) -> LoadedSceneRun:
     """The same as a run that was looked at from above and from below."""
     K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
     up = torch.tensor([0.0, 0.0, 1.0])
-    poses = torch.cat([make_circle_poses(CENTRE, up, 3.0, elevation, 8) for elevation in (-0.6, 0.6)])
+    poses = torch.cat([make_circle_poses(CENTER, up, 3.0, elevation, 8) for elevation in (-0.6, 0.6)])
     orbit = Cameras.pinhole(K.repeat(16, 1, 1), poses, 32, 24)
     return LoadedSceneRun(OmegaConf.create(), make_ball_system(), orbit, to_source, {})

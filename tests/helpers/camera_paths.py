@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from nerf_lightning.cameras import look_at
 
 UP = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-CENTRE = torch.tensor([4.0, -3.0, 1.5], dtype=torch.float64)
+CENTER = torch.tensor([4.0, -3.0, 1.5], dtype=torch.float64)
 RADIUS = 2.0
 
 
@@ -25,48 +25,48 @@ def yaw_cameras(c2w: Float[Tensor, "V 4 4"], yaw: float) -> Float[Tensor, "V 4 4
 def ring_poses(
     count: int = 24, yaw: float = 0.0, elevation: float = 25.0, degrees: float = 360.0, radius: float = RADIUS
 ) -> Float[Tensor, "V 4 4"]:
-    """Cameras around `CENTRE`, or on an arc."""
+    """Cameras around `CENTER`, or on an arc."""
     angle = torch.arange(count, dtype=torch.float64) * math.radians(degrees) / count
     cos, sin = math.cos(math.radians(elevation)), math.sin(math.radians(elevation))
     offset = torch.stack([cos * angle.cos(), cos * angle.sin(), torch.full_like(angle, sin)], dim=1)
-    return yaw_cameras(look_at(CENTRE + radius * offset, CENTRE, UP), yaw)
+    return yaw_cameras(look_at(CENTER + radius * offset, CENTER, UP), yaw)
 
 
 def look_in_directions(
-    centres: Float[Tensor, "V 3"], azimuth: Float[Tensor, "V"], elevation: Float[Tensor, "V"]
+    centers: Float[Tensor, "V 3"], azimuth: Float[Tensor, "V"], elevation: Float[Tensor, "V"]
 ) -> Float[Tensor, "V 4 4"]:
     """Cameras at places that look in directions, radians."""
     level = torch.stack([azimuth.cos(), azimuth.sin()], dim=1) * elevation.cos()[:, None]
-    return look_at(centres, centres + torch.cat([level, elevation.sin()[:, None]], dim=1), UP)
+    return look_at(centers, centers + torch.cat([level, elevation.sin()[:, None]], dim=1), UP)
 
 
 def pan(noise: float = 0.0, degrees: float = 360.0, count: int = 24, seed: int = 0) -> Float[Tensor, "V 4 4"]:
-    """A camera on a tripod at `CENTRE`, whose places are off by some noise."""
+    """A camera on a tripod at `CENTER`, whose places are off by some noise."""
     generator = torch.Generator().manual_seed(seed)
-    centres = CENTRE + noise * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    centers = CENTER + noise * torch.randn(count, 3, generator=generator, dtype=torch.float64)
     turn = torch.arange(count, dtype=torch.float64) * math.radians(degrees) / count
-    return look_in_directions(centres, turn, 0.2 * torch.sin(3 * turn))
+    return look_in_directions(centers, turn, 0.2 * torch.sin(3 * turn))
 
 
 def forward(diverging: float, count: int = 20, seed: int = 0) -> Float[Tensor, "V 4 4"]:
     """Cameras before a wall that look along x; axes turn outward by `diverging` radians a unit, or inward."""
     generator = torch.Generator().manual_seed(seed)
     offset = torch.randn(count, 3, generator=generator, dtype=torch.float64) * torch.tensor([0.05, 0.5, 0.3])
-    return look_in_directions(CENTRE + offset, diverging * offset[:, 1], diverging * offset[:, 2])
+    return look_in_directions(CENTER + offset, diverging * offset[:, 1], diverging * offset[:, 2])
 
 
 def walk(count: int = 40) -> Float[Tensor, "V 4 4"]:
     """Someone walks along a curve and looks where they go."""
     t = torch.linspace(0, 2, count, dtype=torch.float64)
-    centres = CENTRE + 5 * torch.stack([t.cos(), t.sin(), 0.02 * torch.sin(9 * t)], dim=1)
-    return look_in_directions(centres, t + math.pi / 2, torch.zeros_like(t))
+    centers = CENTER + 5 * torch.stack([t.cos(), t.sin(), 0.02 * torch.sin(9 * t)], dim=1)
+    return look_in_directions(centers, t + math.pi / 2, torch.zeros_like(t))
 
 
 def corridor(count: int = 40) -> Float[Tensor, "V 4 4"]:
     """Someone walks straight ahead, looking a little to the left and right."""
     t = torch.linspace(0, 1, count, dtype=torch.float64)
-    centres = CENTRE + torch.stack([8 * t, 0.1 * torch.sin(20 * t), 0 * t], dim=1)
-    return look_in_directions(centres, 0.3 * torch.sin(7 * t), torch.zeros_like(t))
+    centers = CENTER + torch.stack([8 * t, 0.1 * torch.sin(20 * t), 0 * t], dim=1)
+    return look_in_directions(centers, 0.3 * torch.sin(7 * t), torch.zeros_like(t))
 
 
 def dome(count: int = 60, seed: int = 0) -> Float[Tensor, "V 4 4"]:
@@ -74,4 +74,4 @@ def dome(count: int = 60, seed: int = 0) -> Float[Tensor, "V 4 4"]:
     generator = torch.Generator().manual_seed(seed)
     offset = normalize(torch.randn(count, 3, generator=generator, dtype=torch.float64), dim=1)
     offset[:, 2] = offset[:, 2].abs()
-    return look_at(CENTRE + RADIUS * offset, CENTRE, UP)
+    return look_at(CENTER + RADIUS * offset, CENTER, UP)

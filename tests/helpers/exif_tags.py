@@ -14,7 +14,7 @@ def encode_exif(
     aperture: float = 0.0,
     speed: int = 0,
 ) -> bytes:
-    """EXIF, without the tags that are empty or 0; focal lengths in millimetres."""
+    """EXIF, without the tags that are empty or 0; focal lengths in millimeters."""
     exif = Image.Exif()
     details = exif.get_ifd(0x8769)
     for target, tag, value in (

@@ -1,7 +1,7 @@
 """A device that exists only in the dispatcher: what runs on it would run on a GPU, though the machine has none.
 
 Its tensors keep their numbers in a CPU tensor, but refuse to meet CPU tensors and know no `.numpy()`. Autograd, modules, fused
-optimisers and Lightning's Trainer work on it (`accelerator="pretend"`); what is asked of
+optimizers and Lightning's Trainer work on it (`accelerator="pretend"`); what is asked of
 it passes the dispatcher, so `benchmarks.op_counter` counts it. Random numbers come from the CPU's generators, as a
 generator cannot live here.
 """

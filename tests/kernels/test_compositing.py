@@ -13,15 +13,15 @@ from tests.helpers.ragged_samples import BUNDLE, SAMPLE_COUNTS, make_ragged_samp
 
 @pytest.fixture(params=["formula", "auto", "reference"])
 def weights_of(request: pytest.FixtureRequest):
-    """Rendering weights: by the formula, and as the gradient of a ray's colour in the sample's colour."""
+    """Rendering weights: by the formula, and as the gradient of a ray's color in the sample's color."""
     if request.param == "formula":
         return lambda density, samples: volume_weights(density, samples.dt, samples.ray, samples.offsets)
     set_kernels(request.param)
 
     def weights(density: Tensor, samples: Samples) -> Tensor:
         rgb = torch.zeros(len(samples), 3, requires_grad=True)
-        colour, _, _ = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
-        gradients = [torch.autograd.grad(c.sum(), rgb, retain_graph=True)[0][:, i] for i, c in enumerate(colour.T)]
+        color, _, _ = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
+        gradients = [torch.autograd.grad(c.sum(), rgb, retain_graph=True)[0][:, i] for i, c in enumerate(color.T)]
         assert torch.equal(gradients[0], gradients[1]) and torch.equal(gradients[0], gradients[2])
         return gradients[0]
 

@@ -60,7 +60,7 @@ def directions(count: int) -> Tensor:
 
 
 def composite(draw: DRAW) -> Case:
-    """Fields give densities as a column, colours as the transpose of [3, N]."""
+    """Fields give densities as a column, colors as the transpose of [3, N]."""
     t, dt, ray, offsets = packed(draw(COUNTS))
     density = draw(st.sampled_from([0.1, 3.0, 100.0])) * torch.rand(len(t), 2) * (torch.rand(len(t), 2) < 0.7)
     call = lambda d, rgb: k.composite(d[:, 1], rgb.T, t, dt, ray, offsets)  # noqa: E731
@@ -148,7 +148,7 @@ def voxels(draw: DRAW) -> Case:
     kept, terms = torch.rand(6**3) > 1 / 3, draw(st.sampled_from([0, 3, 15]))
     index, unit = torch.where(kept, kept.cumsum(0), 0).int(), 1.2 * torch.rand(draw(SAMPLES), 3) - 0.1
     size = int(index.max()) + 1
-    density, colour, views = torch.randn(size), torch.randn(size, 3), torch.randn(size, 3 * terms)
+    density, color, views = torch.randn(size), torch.randn(size, 3), torch.randn(size, 3 * terms)
     vertex = torch.cat([torch.tensor([-1]), index.nonzero()[:, 0]]).int()
     rows, weights = k.locate_vertices(index, unit)
     basis = k.spherical_harmonics(directions(len(unit)))[:, 1 : 1 + terms]
@@ -158,7 +158,7 @@ def voxels(draw: DRAW) -> Case:
                 Case(k.locate_vertices, [index, unit], spoilt=1),
                 Case(k.interpolate_scalar, [density, index, unit], (0, 2), spoilt=2),
                 Case(k.interpolate_scalar, [density, index, unit], (2,), spoilt=2),
-                Case(k.interpolate_voxels, [density, colour, views, rows, weights, basis], (5,), atol=3e-6, spoilt=4),
+                Case(k.interpolate_voxels, [density, color, views, rows, weights, basis], (5,), atol=3e-6, spoilt=4),
                 Case(lambda values: k.total_variation(values, vertex, index, 1, size), [density], rtol=1e-5, spoilt=0),
                 Case(lambda values: k.total_variation(values, vertex, index, 20, 60), [density], rtol=1e-5, spoilt=0),
             ]

@@ -54,19 +54,19 @@ def brute_force(values: Tensor, index: Tensor, position: list[float]) -> Tensor:
 
 def test_interpolate_voxels_any_position_matches_loop_over_vertices(kernels: str):
     index, unit = sparse_index(), positions(20)
-    density, colour, views = tables(index, 3)
+    density, color, views = tables(index, 3)
     basis = basis_of(len(unit), 3)
-    raw, rgb = interpolate_voxels(density, colour, views, *locate_vertices(index, unit), basis)
+    raw, rgb = interpolate_voxels(density, color, views, *locate_vertices(index, unit), basis)
     for n, position in enumerate(unit.tolist()):
         expected = brute_force(density, index, position)
         torch.testing.assert_close(raw[n].double(), expected, atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(interpolate_scalar(density, index, unit)[n].double(), expected, atol=1e-5, rtol=1e-5)
         turned = brute_force(views.view(-1, 3, 3), index, position) @ basis[n].double()
-        expected = brute_force(colour, index, position) + turned
+        expected = brute_force(color, index, position) + turned
         torch.testing.assert_close(rgb[n].double(), expected, atol=1e-5, rtol=1e-5)
 
 
-def test_total_variation_matches_loop_over_neighbours(kernels: str):
+def test_total_variation_matches_loop_over_neighbors(kernels: str):
     index = sparse_index()
     (values, *_) = tables(index, 0)
     vertex, rows = vertices_of(index), rows_of(index)

@@ -25,7 +25,7 @@ def hashgrid(bounds: Bounds) -> Field:
 
 def tensorf(bounds: Bounds) -> Field:
     field = TensoRFField(bounds, 3, 8, base_resolution=4, max_resolution=4, stages=1, width=8)
-    for parameter in (*field.density_volume.parameters(), *field.colour_volume.parameters()):
+    for parameter in (*field.density_volume.parameters(), *field.color_volume.parameters()):
         torch.nn.init.normal_(parameter)
     return field
 
@@ -44,7 +44,7 @@ def random_directions(count: int) -> torch.Tensor:
 
 @FIELDS
 @pytest.mark.parametrize(("unbounded", "count"), [(False, 0), (True, 50)])
-def test_field_any_positions_gives_density_and_colour(make: Make, unbounded: bool, count: int):
+def test_field_any_positions_gives_density_and_color(make: Make, unbounded: bool, count: int):
     field, positions = make(Bounds(BOX, unbounded)), random_positions(count) * 3
     density, rgb, _ = field(positions, random_directions(count))
     assert density.shape == (count,) and rgb.shape == (count, 3)
@@ -56,7 +56,7 @@ def test_field_any_positions_gives_density_and_colour(make: Make, unbounded: boo
 
 
 @FIELDS
-def test_field_other_unit_of_length_gives_same_colours(make: Make):
+def test_field_other_unit_of_length_gives_same_colors(make: Make):
     small, large = make(Bounds(BOX)), make(Bounds(BOX * 10))
     large.load_state_dict(small.state_dict())
     positions, directions = random_positions(40), random_directions(40)

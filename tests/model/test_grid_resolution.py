@@ -71,9 +71,9 @@ def test_tensorf_large_photos_enlarge_planes_and_network(unbounded: bool, across
     """Plane entries scale with the width of the photos, neurons with the resolution of the planes."""
     bounds = Bounds(BOX, unbounded, pixel_footprint=2 / across)
     field, explicit = TensoRFField(bounds, 2, 2), TensoRFField(bounds, 2, 2, max_resolution=100, width=24)
-    assert field.resolutions[-1] == max_resolution and field.colour_net[0].out_features == width
-    assert explicit.resolutions[-1] == 100 and explicit.colour_net[0].out_features == 24
-    assert TensoRFField(bounds, 2, 2, max_resolution=100).colour_net[0].out_features == 32
+    assert field.resolutions[-1] == max_resolution and field.color_net[0].out_features == width
+    assert explicit.resolutions[-1] == 100 and explicit.color_net[0].out_features == 24
+    assert TensoRFField(bounds, 2, 2, max_resolution=100).color_net[0].out_features == 32
     assert TensoRFField(Bounds(BOX, unbounded), 2, 2, base_resolution=200).resolutions[-1] == 200
 
 

@@ -74,10 +74,10 @@ BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("kind", [TensoRFField, HashGridField])
-def test_colours_vary_with_direction_up_to_degree(kind: type, degree: int, kernels: str):
-    """With all ReLUs active, colour logits are polynomials of that degree: on a circle their Fourier series ends there."""
+def test_colors_vary_with_direction_up_to_degree(kind: type, degree: int, kernels: str):
+    """With all ReLUs active, color logits are polynomials of that degree: on a circle their Fourier series ends there."""
     field = kind(BOX, degree=degree, width=8)
-    first, *others = field.colour_net
+    first, *others = field.color_net
     first.bias.data += 4.0
     for layer in others:
         layer.weight.data -= layer.weight.data.mean(1, keepdim=True)  # cancels the constant 4 of the layer before

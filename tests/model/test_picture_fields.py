@@ -37,7 +37,7 @@ def test_picture_field_any_size_learns_with_all_parameters(make, size: tuple[int
 
 @FIELDS
 def test_picture_field_smooth_picture_is_learned(make):
-    """100 steps reduce the squared error below a twentieth of that of the best constant colour."""
+    """100 steps reduce the squared error below a twentieth of that of the best constant color."""
     x, y = pixel_grid(48, 64).T
     smooth = torch.stack([0.5 + 0.4 * torch.sin(5 * x), 0.5 + 0.4 * torch.cos(4 * y + 2 * x), 0.2 + 0.6 * x * y], dim=1)
     image = (255 * smooth).round().byte().view(48, 64, 3)
@@ -59,7 +59,7 @@ def test_picture_field_smooth_picture_is_learned(make):
 
 
 @pytest.mark.parametrize("size", [(16, 12), (33, 7)])
-def test_hash_grid_2d_last_level_has_vertex_at_pixel_centre(size: tuple[int, int]):
+def test_hash_grid_2d_last_level_has_vertex_at_pixel_center(size: tuple[int, int]):
     width, height = size
     field = HashGrid2DField(size, num_levels=3, log2_hashmap_size=8, base_resolution=4)
     assert field.grid.cells[-1] == (width - 1, height - 1)

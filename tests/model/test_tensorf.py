@@ -9,7 +9,7 @@ from tests.helpers.growth import grow
 BOX = Bounds(torch.tensor([[-2.0, -1, 0], [2, 3, 5]]))
 SMALL = {
     "density_components": 3,
-    "colour_components": 8,
+    "color_components": 8,
     "base_resolution": 4,
     "max_resolution": 16,
     "stages": 3,
@@ -19,7 +19,7 @@ SMALL = {
 
 def field(**options) -> TensoRFField:
     made = TensoRFField(BOX, **SMALL | {"width": 8} | options)
-    for volume in (made.density_volume, made.colour_volume):
+    for volume in (made.density_volume, made.color_volume):
         for parameter in volume.parameters():
             parameter.data = torch.randn(parameter.shape)
     return made
@@ -48,7 +48,7 @@ def test_tensorf_grows_with_progress_and_never_back():
     assert [tensorf.growth.stage_at(p) for p in (0.0, 0.24, 0.25, 0.49, 0.5, 1.0)] == [0, 0, 1, 1, 2, 2]
     at_once = field(growth_end=0.0).growth
     assert at_once is not None and at_once.stage_at(0.0) == 2 and field(max_resolution=4, stages=1).growth is None
-    volumes = [*tensorf.density_volume.parameters(), *tensorf.colour_volume.parameters()]
+    volumes = [*tensorf.density_volume.parameters(), *tensorf.color_volume.parameters()]
     assert grow(tensorf, 0.2) == []
     for progress, cells in ((0.25, 8), (0.9, 16)):
         replaced = grow(tensorf, progress)

@@ -32,16 +32,16 @@ def read_positions(voxels: VoxelField, low: float = 0.0, high: float = 1.0, coun
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_voxels_density_and_colour_follow_tables(degree: int, kernels: str):
+def test_voxels_density_and_color_follow_tables(degree: int, kernels: str):
     voxels, x, d = field(degree=degree, density_lr_scale=2.0), positions(), directions()
     density, rgb, _ = voxels(x, d)
     rows, weights = locate_vertices(voxels.index, BOX.to_unit(x))
-    raw, colour, views = (interpolate_rows(table, rows, weights) for table in voxels.tables)
+    raw, color, views = (interpolate_rows(table, rows, weights) for table in voxels.tables)
     torch.testing.assert_close(density, torch.exp(voxels.density_lr_scale * raw) / 2)  # half the box is two units long
     torch.testing.assert_close(voxels.density(x), density)
     terms = (degree + 1) ** 2 - 1
     turned = torch.einsum("ncb,nb->nc", views.view(200, 3, terms), spherical_harmonics(d)[:, 1 : 1 + terms])
-    torch.testing.assert_close(rgb, torch.sigmoid(colour + turned), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(rgb, torch.sigmoid(color + turned), atol=1e-5, rtol=1e-4)
 
 
 def test_voxels_upsample_keeps_values_at_read_vertices():

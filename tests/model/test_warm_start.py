@@ -30,9 +30,9 @@ def hashgrid(entries: int = 6, width: int = 8, **options: int) -> Field:
     return field
 
 
-def tensorf(components: int = 3, colours: int = 3, max_resolution: int = 6, width: int = 8, degree: int = 3) -> Field:
+def tensorf(components: int = 3, colors: int = 3, max_resolution: int = 6, width: int = 8, degree: int = 3) -> Field:
     """With numbers of components for which kernels are already compiled."""
-    return TensoRFField(BOX, components, colours, max_resolution, max_resolution, stages=1, width=width, degree=degree)
+    return TensoRFField(BOX, components, colors, max_resolution, max_resolution, stages=1, width=width, degree=degree)
 
 
 def voxels(max_resolution: int = 6, degree: int = 1, base_resolution: int = 6) -> Field:
@@ -48,7 +48,7 @@ def mlp(width: int = 8, depth: int = 2, skip: int | None = None) -> Field:
 
 SAME = [
     (hashgrid, {}, {"entries": 13, "width": 12}),
-    (tensorf, {"degree": 1}, {"degree": 3, "max_resolution": 12, "width": 16, "components": 8, "colours": 8}),
+    (tensorf, {"degree": 1}, {"degree": 3, "max_resolution": 12, "width": 16, "components": 8, "colors": 8}),
     (voxels, {}, {"degree": 2, "max_resolution": 12}),
     (mlp, {}, {"depth": 4, "width": 16}),
 ]

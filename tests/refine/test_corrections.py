@@ -1,4 +1,4 @@
-"""Corrections as they act on rays and colours, their gradients through every field, and a run with them."""
+"""Corrections as they act on rays and colors, their gradients through every field, and a run with them."""
 
 import json
 from dataclasses import replace
@@ -43,7 +43,7 @@ def correct_all(cameras: Cameras) -> Corrections:
 
 @pytest.fixture
 def cameras() -> Cameras:
-    """Around the box, looking at its centre."""
+    """Around the box, looking at its center."""
     return make_ball_cameras(VIEWS, SIZE)
 
 
@@ -58,7 +58,7 @@ def test_corrections_initial_values_are_identity(cameras: Cameras):
     torch.testing.assert_close((same.origins, same.directions), (rays.origins, rays.directions))
     torch.nn.init.normal_(corrections.poses.pose_adjustment), torch.nn.init.normal_(corrections.color.log_gains)
     before = corrections.poses.refine_cameras(cameras).c2w
-    together = compute_gauge_modes(cameras.centres, BOX.centre) @ torch.randn(10)
+    together = compute_gauge_modes(cameras.centers, BOX.center) @ torch.randn(10)
     corrections.poses.pose_adjustment.data += torch.linalg.solve(corrections.poses.preconditioner, together)
     torch.testing.assert_close(corrections.poses.refine_cameras(cameras).c2w, before, atol=1e-4, rtol=0)
     torch.testing.assert_close(corrections.color.gains.log().mean(0), torch.zeros(3), atol=1e-6, rtol=0)
@@ -134,7 +134,7 @@ def test_corrections_known_field_recover_lens_and_colors(cameras: Cameras):
     for name in ("focal_factor", "corner_brightness"):
         found, before, right = (summarize_corrections(by)[name] for by in (corrections, wrong, truth))
         assert abs(found - right) < 0.3 * abs(before - right)
-    # A photo's gains are the diagonal of how it mixes colours.
+    # A photo's gains are the diagonal of how it mixes colors.
     found, meant, none = (
         by.color.color_matrices[:, :, :3] + torch.diag_embed(by.color.gains) for by in (corrections, truth, wrong)
     )
@@ -218,7 +218,7 @@ def test_train_with_corrections_reports_and_exports_poses(tmp_path: Path, capsys
     again = [
         reload_data(load_config(tmp_path), read_scene_file(tmp_path), corrected=which).scene for which in (True, False)
     ]
-    moved, given = ([poses.train.cameras.centres for poses in again][i] for i in (0, 1))
+    moved, given = ([poses.train.cameras.centers for poses in again][i] for i in (0, 1))
     torch.testing.assert_close((moved - given).norm(dim=1), torch.tensor(found["moved"]), atol=2e-5, rtol=0)
     assert found["moved"][0] > 0 and torch.equal(again[0].val.cameras.c2w, again[1].val.cameras.c2w)
     export_transforms(tmp_path)

@@ -27,30 +27,30 @@ def test_rotate_axis_angle_any_angle_matches_rotation_matrix():
 
 
 def test_projection_jacobian_matches_finite_differences():
-    centres, places, focals = 3 * torch.randn(4, 3).double(), 0.3 * torch.randn(20, 3).double(), torch.full((4,), 90.0)
+    centers, places, focals = 3 * torch.randn(4, 3).double(), 0.3 * torch.randn(20, 3).double(), torch.full((4,), 90.0)
     pose_adjustment = 1e-6 * torch.randn(4, 6).double()
-    before = places - centres[:, None]
+    before = places - centers[:, None]
     back = torch.linalg.matrix_exp(cross(-pose_adjustment[:, :3]))
-    after = (places - centres[:, None] - pose_adjustment[:, None, 3:]) @ back.mT
+    after = (places - centers[:, None] - pose_adjustment[:, None, 3:]) @ back.mT
     expected = 90 * (torch.nn.functional.normalize(after, dim=2) - torch.nn.functional.normalize(before, dim=2))
-    found = (compute_projection_jacobian(centres, focals.double(), places) @ pose_adjustment[:, None, :, None]).squeeze(
+    found = (compute_projection_jacobian(centers, focals.double(), places) @ pose_adjustment[:, None, :, None]).squeeze(
         3
     )
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-9)
 
 
 def test_gauge_modes_moved_with_content_leave_views_unchanged():
-    centres, place = 3 * torch.nn.functional.normalize(torch.randn(5, 3).double(), dim=1), torch.randn(3).double()
-    centres, places = centres + place, place + 0.2 * torch.randn(50, 3).double()
+    centers, place = 3 * torch.nn.functional.normalize(torch.randn(5, 3).double(), dim=1), torch.randn(3).double()
+    centers, places = centers + place, place + 0.2 * torch.randn(50, 3).double()
     found, shifts = (
-        compute_gauge_modes(centres, place),
-        compute_projection_jacobian(centres, torch.full((5,), 90.0).double(), places),
+        compute_gauge_modes(centers, place),
+        compute_projection_jacobian(centers, torch.full((5,), 90.0).double(), places),
     )
     axes = torch.eye(3).double().expand(50, 3, 3)
     rotations = torch.linalg.cross(axes, (places - place)[:, :, None].expand(50, 3, 3), dim=1)
     content = torch.cat([axes, rotations, (places - place)[:, :, None], axes], dim=2)
     follows = (
-        compute_projection_jacobian(centres, torch.full((5,), 90.0).double(), places)[..., 3:] @ -content
+        compute_projection_jacobian(centers, torch.full((5,), 90.0).double(), places)[..., 3:] @ -content
     )  # as a move of the camera, turned
     left = (shifts @ found[:, None] + follows).square().mean((1, 2)).sqrt() / follows.square().mean((1, 2)).sqrt()
     torch.testing.assert_close(left[:, :7], torch.zeros(5, 7).double(), atol=1e-9, rtol=0)
@@ -58,8 +58,8 @@ def test_gauge_modes_moved_with_content_leave_views_unchanged():
 
 
 def test_preconditioner_unit_motion_shifts_points_by_one_pixel():
-    centres, places = 3 * torch.nn.functional.normalize(torch.randn(5, 3).double(), dim=1), torch.rand(500, 3).double()
-    shifts = compute_projection_jacobian(centres, torch.full((5,), 200.0).double(), places - 0.5)
+    centers, places = 3 * torch.nn.functional.normalize(torch.randn(5, 3).double(), dim=1), torch.rand(500, 3).double()
+    shifts = compute_projection_jacobian(centers, torch.full((5,), 200.0).double(), places - 0.5)
     free, damped = (
         (shifts @ compute_preconditioner(shifts, damping)[:, None]).square().sum(2).mean(1).sqrt()
         for damping in (1e-9, 1.0)

@@ -15,12 +15,12 @@ from nerf_lightning.render.path_file import read_path
 from nerf_lightning.synthetic.bricks import bricks
 
 UP = torch.tensor([0.0, 0.6, 0.8])
-CENTRE = torch.tensor([1.0, -2.0, 0.5])
+CENTER = torch.tensor([1.0, -2.0, 0.5])
 K = torch.tensor([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]])
 
 
 def circle(frames: int = 12, elevation: float = 0.5) -> Cameras:
-    return Cameras.pinhole(K.repeat(frames, 1, 1), make_circle_poses(CENTRE, UP, 3.0, elevation, frames), 16, 12)
+    return Cameras.pinhole(K.repeat(frames, 1, 1), make_circle_poses(CENTER, UP, 3.0, elevation, frames), 16, 12)
 
 
 def test_resample_path_more_frames_interpolate():
@@ -30,7 +30,7 @@ def test_resample_path_more_frames_interpolate():
     expected = circle(24).c2w
     torch.testing.assert_close(fine.c2w[:, :3, :3], expected[:, :3, :3], atol=0.02, rtol=0)  # the last one, too
     height = 3 * (1 - math.cos(math.pi / 12))  # of a chord
-    assert (fine.centres - expected[:, :3, 3]).norm(dim=1).max() < height + 1e-4
+    assert (fine.centers - expected[:, :3, 3]).norm(dim=1).max() < height + 1e-4
 
 
 def test_resample_path_open_keeps_ends():

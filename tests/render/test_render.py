@@ -37,7 +37,7 @@ def test_render_channels_are_side_by_side_at_any_scale(run: Path, tmp_path: Path
     render(run, frames=3, channels="rgb,depth,opacity", scale=1.5, path="spiral", output=tmp_path / "video")
     frames = [imageio.imread(path) for path in (tmp_path / "video").glob("*.png")]
     assert [frame.shape for frame in frames] == [(24, 72, 3)] * 3
-    assert all((frame[:, 48:, 0] == frame[:, 48:, 1]).all() for frame in frames), "opacity is grey"
+    assert all((frame[:, 48:, 0] == frame[:, 48:, 1]).all() for frame in frames), "opacity is gray"
 
 
 def test_render_test_path_shows_photos_and_renders(run: Path, tmp_path: Path):

@@ -9,11 +9,11 @@ import pytest
 from nerf_lightning.errors import InputError
 from nerf_lightning.render.video import write_video
 
-COLOURS = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
+COLORS = [(255, 0, 0), (0, 255, 0), (0, 0, 255)]
 
 
 def plain(index: int, height: int = 9, width: int = 15) -> np.ndarray:
-    return np.full((height, width, 3), COLOURS[index], np.uint8)
+    return np.full((height, width, 3), COLORS[index], np.uint8)
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".webp", ".mp4"])
@@ -22,8 +22,8 @@ def test_write_video_frames_are_in_order_and_at_their_size(suffix: str, tmp_path
     assert write_video({}, plain, 3, output, fps=10) == 0
     film = imageio.imread(output, plugin="pyav" if suffix == ".mp4" else "pillow", index=...)
     assert film.shape == (3, *((10, 16) if suffix == ".mp4" else (9, 15)), 3)  # one more row and column, no resize
-    for shown, colour in zip(film, COLOURS, strict=True):
-        assert np.abs(shown.astype(int) - colour).max() <= (0 if suffix == ".gif" else 12)
+    for shown, color in zip(film, COLORS, strict=True):
+        assert np.abs(shown.astype(int) - color).max() <= (0 if suffix == ".gif" else 12)
     assert [path.name for path in tmp_path.iterdir()] == [output.name]
 
 

@@ -17,7 +17,7 @@ def along_z(count: int, dtype: torch.dtype = torch.float32) -> Rays:
 
 
 def fixed(density: Tensor, rgb: Tensor):
-    """A field with this density and colour per sample."""
+    """A field with this density and color per sample."""
     return lambda positions, directions: (density, rgb)
 
 
@@ -29,12 +29,12 @@ def test_render_matches_loop_over_samples(kernels: str):
     output = VolumeRenderer()(rays, samples, fixed(density, rgb), behind)
     i = 0
     for ray, count in enumerate(counts):
-        left, colour, depth = 1.0, torch.zeros(3), 0.0
+        left, color, depth = 1.0, torch.zeros(3), 0.0
         for _ in range(count):
             weight = left * float(-torch.expm1(-density[i] * samples.dt[i]))
-            colour, depth, left = colour + weight * rgb[i], depth + weight * float(samples.t[i]), left - weight
+            color, depth, left = color + weight * rgb[i], depth + weight * float(samples.t[i]), left - weight
             i += 1
-        torch.testing.assert_close(output.rgb[ray], colour + left * behind[ray], rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(output.rgb[ray], color + left * behind[ray], rtol=1e-4, atol=1e-5)
         assert float(output.opacity[ray]) == pytest.approx(1 - left, abs=1e-5)
         assert float(output.depth[ray]) == pytest.approx(depth / (1 - left) if count else 0, rel=1e-4)
 
@@ -52,20 +52,20 @@ def test_render_thin_wall_depth_is_its_distance(distance: float, kernels: str):
 
 
 @pytest.mark.parametrize(
-    ("background", "colour", "sigma"),
+    ("background", "color", "sigma"),
     [
         ("white", (1, 1, 1), 0.0),
         ([0.1, 0.5, 1], (0.1, 0.5, 1), 0.3),
         ("random", SCENE, 0.3),
     ],
 )
-def test_render_uncovered_part_shows_background(background, colour, sigma, kernels: str):
+def test_render_uncovered_part_shows_background(background, color, sigma, kernels: str):
     samples = make_ragged_samples([5])
     red = torch.tensor([1.0, 0, 0]).repeat(5, 1)
     output = VolumeRenderer(background, SCENE)(along_z(1), samples, fixed(torch.full((5,), sigma), red))
     opacity = -torch.expm1(-sigma * samples.dt.sum())
     torch.testing.assert_close(output.opacity[0], opacity)
-    torch.testing.assert_close(output.rgb[0], opacity * red[0] + (1 - opacity) * torch.tensor(colour).float())
+    torch.testing.assert_close(output.rgb[0], opacity * red[0] + (1 - opacity) * torch.tensor(color).float())
     assert (float(output.depth) == 0) == (sigma == 0)
 
 
@@ -83,8 +83,8 @@ def test_backgrounds_random_need_generator():
     assert torch.equal(first, again) and not torch.equal(first, other)
     assert first.std(0).min() > 0.2 and first.min() >= 0 and first.max() <= 1
     assert torch.equal(renderer.background.sample(2), torch.tensor(SCENE).expand(2, 3))
-    colours = VolumeRenderer("white").background.sample(2, Generator())
-    assert torch.equal(colours, torch.ones(2, 3))
+    colors = VolumeRenderer("white").background.sample(2, Generator())
+    assert torch.equal(colors, torch.ones(2, 3))
 
 
 @pytest.mark.parametrize("background", ["green", [0.1, 0.2, 0.3, 0.4], [0, 0, 1.5]])

@@ -15,7 +15,7 @@ from nerf_lightning.dataset.picture import make_builtin_picture
 from nerf_lightning.dataset.pixel_datamodule import Picture
 from nerf_lightning.errors import InputError
 from nerf_lightning.export import compress
-from nerf_lightning.runs.compact import MAX_HEADER_BYTES, decode, encode, load_compact, strip_local_paths
+from nerf_lightning.runs.compact import MAX_HEADER_BYTES, decode_run, encode_system, load_compact, strip_local_paths
 from nerf_lightning.runs.folder import config_to_dict
 from nerf_lightning.runs.scene_file import scene_to_dict
 from nerf_lightning.synthetic.objects import MARBLE, make_object_scene
@@ -42,7 +42,7 @@ def make_run(folder: Path, *given: str) -> Run:
 
 def make_compact(run: Run, precision: str = "byte") -> bytes:
     system, data, config = run
-    return encode(system, precision, config, scene_to_dict(data))
+    return encode_system(system, precision, config, scene_to_dict(data))
 
 
 @pytest.mark.parametrize(
@@ -59,7 +59,7 @@ def test_compact_file_renders_like_the_run_in_fewer_bytes(given: tuple[str, ...]
     run = make_run(tmp_path, *given)
     system, data, _ = run
     content = make_compact(run)
-    small = decode(content, "compact").system
+    small = decode_run(content, "compact").system
     size = sum(tensor.numel() * tensor.element_size() for tensor in system.state_dict().values())
     assert len(content) < 0.6 * size
     view = data.get_held_out_view(0)
@@ -116,6 +116,6 @@ def test_load_compact_damaged_or_untrusted_file_raises(tmp_path: Path):
         (with_header(content, scene=[]), "given.npz"),
     ):
         with pytest.raises(InputError, match=words):
-            decode(damaged, "given.npz")
+            decode_run(damaged, "given.npz")
     with pytest.raises(InputError, match="no such file"):
         load_compact(tmp_path / "missing.npz")

@@ -63,12 +63,12 @@ def test_occupancy_cell_visible_again_is_active_again():
     assert sampler.grid.active[middle] and not sampler.grid.active[behind]
 
 
-def ball(centre: float = 0.0):
-    return lambda x: 40.0 * ((x - torch.tensor([centre, 0, 0])).norm(dim=-1) < 0.5).float()
+def ball(center: float = 0.0):
+    return lambda x: 40.0 * ((x - torch.tensor([center, 0, 0])).norm(dim=-1) < 0.5).float()
 
 
 def cells(resolution: int) -> tuple[Tensor, float]:
-    """Centres of all cells of the cube, and the distance from centre to corner."""
+    """Centers of all cells of the cube, and the distance from center to corner."""
     middle = (torch.arange(resolution) + 0.5) / resolution * 2 - 1
     return torch.cartesian_prod(middle, middle, middle), math.sqrt(3) / resolution
 
@@ -76,11 +76,11 @@ def cells(resolution: int) -> tuple[Tensor, float]:
 def test_occupancy_updates_find_content():
     sampler = OccupancySampler(CUBE, samples=64, resolution=12, warmup=64)
     assert sampler.grid.occupied.all(), "nothing is skipped before anything is known"
-    centre, corner = cells(12)
+    center, corner = cells(12)
     for step in range(0, 800, 16):
         sampler.update(step, ball(), seeded(step))
-        assert sampler.grid.occupied[centre.norm(dim=-1) < 0.5 - corner].all(), "occupied cells stay occupied"
-    assert not sampler.grid.occupied[centre.norm(dim=-1) > 0.5 + corner].any()
+        assert sampler.grid.occupied[center.norm(dim=-1) < 0.5 - corner].all(), "occupied cells stay occupied"
+    assert not sampler.grid.occupied[center.norm(dim=-1) > 0.5 + corner].any()
 
 
 @pytest.mark.parametrize(("share", "kept"), [(0.5, False), (2.0, True)])

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -41,3 +43,11 @@ def test_split_by_rays_any_size_yields_complete_rays(max_samples: int):
     assert rays == list(range(40))
     assert torch.equal(torch.cat(t), samples.t)
     assert torch.equal(torch.cat(ray), samples.ray)
+
+
+def test_clip_and_split_select_values_of_each_sample():
+    samples = pack(torch.rand(40, 7).sort(dim=1).values, torch.rand(40, 6) < 0.7)
+    samples = replace(samples, cached_positions=samples.t[:, None].expand(-1, 3), optical_depth=2 * samples.t)
+    for part in (samples.clip(0.3, 0.6), *(part for _, part in split_by_rays(samples, 20))):
+        assert len(part) and torch.equal(part.optical_depth, 2 * part.t)
+        assert torch.equal(part.cached_positions, part.t[:, None].expand(-1, 3))

@@ -7,7 +7,7 @@ from nerf_lightning.sizing.choose import (
     Target,
     choose_candidate,
     choose_final,
-    choose_neighbour,
+    choose_neighbor,
     is_growth_finished,
 )
 
@@ -67,10 +67,10 @@ def test_choose_candidate_returns_smallest_sufficient(psnrs: tuple, target: Targ
         ((21.2, 23.4, 25.4, 27.4, 28.9, 29.7, 30.2), Target(psnr=31), 6, 33.5, 4),
     ],
 )
-def test_choose_neighbour_returns_rung_that_may_change_choice(
+def test_choose_neighbor_returns_rung_that_may_change_choice(
     psnrs: tuple, target: Target, first: int, full: float, second: int | None
 ):
-    assert choose_neighbour(first, full, rungs(*psnrs), target, last=3) == second
+    assert choose_neighbor(first, full, rungs(*psnrs), target, last=3) == second
 
 
 @pytest.mark.parametrize(

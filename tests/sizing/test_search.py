@@ -25,14 +25,14 @@ from tests.helpers.growth import grow
 RUNGS = [
     {
         "density_components": 3,
-        "colour_components": 3,
+        "color_components": 3,
         "base_resolution": 4,
         "max_resolution": 4,
         "width": 8,
         "stages": 1,
     },
-    {"density_components": 8, "colour_components": 8, "base_resolution": 8, "max_resolution": 16, "width": 16},
-    {"density_components": 8, "colour_components": 8, "base_resolution": 8, "max_resolution": 24, "width": 16},
+    {"density_components": 8, "color_components": 8, "base_resolution": 8, "max_resolution": 16, "width": 16},
+    {"density_components": 8, "color_components": 8, "base_resolution": 8, "max_resolution": 24, "width": 16},
 ]
 SAMPLERS = [{"samples": 32, "resolution": 8}, {"samples": 64, "resolution": 16}]
 FAST = ["threads=1", "device=cpu", "callbacks.snapshots.steps=[]", "budget.steps=60"]
@@ -129,7 +129,7 @@ def test_describe_scene_distinguishes_experiments_scenes_and_images(tmp_path: Pa
         ),
         (
             "tensorf_small",
-            [{**RUNGS[1], "width": None}, {**RUNGS[1], "width": 8}, {**RUNGS[1], "colour_components": 3}],
+            [{**RUNGS[1], "width": None}, {**RUNGS[1], "width": 8}, {**RUNGS[1], "color_components": 3}],
         ),
     ],
 )

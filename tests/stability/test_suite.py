@@ -12,7 +12,7 @@ import torch
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.dataset import Picture
 from nerf_lightning.stability.conditions import CONDITIONS, METHODS, make_waves
-from nerf_lightning.stability.report import find_rescues, is_passed, judge, summarize, write_report
+from nerf_lightning.stability.report import find_rescues, is_passed, judge_trials, summarize, write_report
 from nerf_lightning.stability.trial import Trial, TrialResult, get_trial_folder, list_trials, run_trial, run_trials
 
 GOOD = TrialResult("clean", "hashgrid", 0, 30.0, "finished", "", 0, "")
@@ -108,8 +108,8 @@ def test_is_passed_follows_condition(name: str, result: TrialResult, good: bool)
 def test_judge_compares_a_seed_with_its_own_clean_run():
     clean = [replace(GOOD, seed=seed, psnr=psnr) for seed, psnr in enumerate((30.0, 27.0, 30.0))]
     scaled = [replace(one, condition="world x10") for one in clean]
-    assert [len(one.failed) for one in judge([*clean, *scaled])] == [0, 0]
-    assert [len(one.failed) for one in judge([*clean, *scaled[:2], replace(scaled[2], psnr=28.5)])] == [0, 1]
+    assert [len(one.failed) for one in judge_trials([*clean, *scaled])] == [0, 0]
+    assert [len(one.failed) for one in judge_trials([*clean, *scaled[:2], replace(scaled[2], psnr=28.5)])] == [0, 1]
 
 
 def test_find_rescues_compares_recovery_twin_with_clean_runs():
@@ -121,10 +121,10 @@ def test_find_rescues_compares_recovery_twin_with_clean_runs():
     results += [replace(lost, condition="rate x30"), replace(guarded, condition="rate x30", psnr=29.0)]
     rescues = find_rescues(results)
     assert rescues == [True, False, True]
-    lines = summarize(judge(results), rescues)
+    lines = summarize(judge_trials(results), rescues)
     assert "clean, relu mlp, no recovery (2/3 failed); rate x30, relu mlp, no recovery (1/1 failed)" in lines[0]
     assert "2 of 3" in lines[1]
-    assert "proves nothing" in summarize(judge(results[:1]), [])[0]
+    assert "proves nothing" in summarize(judge_trials(results[:1]), [])[0]
 
 
 def test_write_report_lists_failures(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -142,4 +142,4 @@ def test_write_report_lists_failures(tmp_path: Path, capsys: pytest.CaptureFixtu
     heatmap = imageio.imread(tmp_path / "heatmap.png")
     assert (heatmap == (213, 94, 0)).all(-1).mean() > 0.01, "the failed cell is vermillion"
     assert (imageio.imread(tmp_path / "worst.png") == 90).all(-1).mean() > 0.1
-    assert [judge(results)[n].describe() for n in (1, 2)] == [["18.0 dB", "1/3 failed"], ["refused"]]
+    assert [judge_trials(results)[n].describe() for n in (1, 2)] == [["18.0 dB", "1/3 failed"], ["refused"]]

@@ -23,7 +23,7 @@ def scene():
 
 def make_solid(cylinder: bool, half: tuple[float, float, float], axes: object = np.eye(3)) -> Solids:
     plain = {name: np.zeros(1) for name in ("period", "gloss")}
-    plain |= {"colour": np.ones((1, 3)), "accent": np.ones((1, 3)), "pattern": np.zeros(1, int)}
+    plain |= {"color": np.ones((1, 3)), "accent": np.ones((1, 3)), "pattern": np.zeros(1, int)}
     return Solids(np.array([cylinder]), np.zeros((1, 3)), np.array([half], float), np.array([axes], float), **plain)
 
 
@@ -77,10 +77,10 @@ def test_bricks_cameras_match_the_paper(scene):
     aabb = torch.from_numpy(load_bulldozer().aabb).float()
     torch.testing.assert_close(scene.bounds.half_size, 1.02 * Bounds(aabb).half_size)
     for cameras in (scene.train.cameras, scene.val.cameras, scene.orbit):
-        torch.testing.assert_close(cameras.centres.norm(dim=-1), torch.full((len(cameras),), 4.0311))
+        torch.testing.assert_close(cameras.centers.norm(dim=-1), torch.full((len(cameras),), 4.0311))
         looks = cameras.c2w[:, :3, 2]
-        torch.testing.assert_close(looks, -cameras.centres / 4.0311, atol=1e-5, rtol=0)
-        assert (cameras.centres[:, 2] > 0).all()
+        torch.testing.assert_close(looks, -cameras.centers / 4.0311, atol=1e-5, rtol=0)
+        assert (cameras.centers[:, 2] > 0).all()
         assert (cameras.c2w[:, 2, 1] < 0).all()  # the image's down goes down
         torch.testing.assert_close(cameras.c2w[:, 2, 0], torch.zeros(len(cameras)), atol=1e-6, rtol=0)  # no roll
         # 800 px at 1111.111 px focal length are the paper's; 40 px are a twentieth.
@@ -90,7 +90,7 @@ def test_bricks_cameras_match_the_paper(scene):
 
 def test_bricks_held_out_views_differ_from_training_views():
     scene = bricks(size=1)
-    train, val = (views.cameras.centres / 4.0311 for views in (scene.train, scene.val))
+    train, val = (views.cameras.centers / 4.0311 for views in (scene.train, scene.val))
     assert (len(train), len(val), len(scene.orbit)) == (100, 10, 60)
     angles = torch.rad2deg((val @ train.T).clamp(-1, 1).arccos().amin(1))
     # Spread: whatever the direction, a training view is near, and all heights occur.

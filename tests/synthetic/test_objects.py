@@ -36,11 +36,11 @@ def test_intersect_gives_distance_and_normal(body, start, direction, distance, n
 def test_trace_rays_of_two_primitives_hits_nearer():
     near, far = Sphere((0.0, 0.0, 1.0), 0.3), Sphere((0.0, 0.0, -1.0), 0.3)
     down = ray([0.0, 0.0, 4.0], [0.0, 0.0, -1.0])
-    colour, distance, index = trace_rays([far, near], down)
-    assert torch.equal(colour, trace_rays([near], down)[0])
+    color, distance, index = trace_rays([far, near], down)
+    assert torch.equal(color, trace_rays([near], down)[0])
     assert distance.tolist() == pytest.approx([2.7]) and index.tolist() == [1]
-    colour, distance, _ = trace_rays([far, near], ray([0.0, 0.0, 4.0], [0.0, 0.0, 1.0]))
-    assert colour.tolist() == [[0, 0, 0]] and distance.tolist() == [math.inf]
+    color, distance, _ = trace_rays([far, near], ray([0.0, 0.0, 4.0], [0.0, 0.0, 1.0]))
+    assert color.tolist() == [[0, 0, 0]] and distance.tolist() == [math.inf]
 
 
 def test_make_object_scene_shows_sphere_at_its_size():
@@ -54,7 +54,7 @@ def test_make_object_scene_shows_sphere_at_its_size():
 def test_make_room_scene_is_photographed_from_ring_around_subject():
     room = ROOMS["small subject"]
     scene = make_room_scene(room, 0, size=16, views=8, held_out=2)
-    eyes = torch.cat([scene.train.cameras.centres, scene.val.cameras.centres])
+    eyes = torch.cat([scene.train.cameras.centers, scene.val.cameras.centers])
     assert ((eyes.norm(dim=1) - 1).abs() < 0.4).all() and (eyes[:, 2] > 0).all() and scene.bounds.unbounded
     _, distance, body = trace_rays(room.primitives, scene.train.cameras.generate_view_rays(0))
     assert distance.isfinite().all() and 0 < float((body < room.num_subject_primitives).float().mean()) < 0.1
@@ -70,12 +70,12 @@ def test_corruptions_of_poses_and_bounds_have_their_size():
         flipped[:, :3, 3], original[:, :3, 3]
     )
     big = corruptions.scale_world(scene, 0, 10.0)
-    assert torch.equal(big.train.cameras.centres, 10 * original[:, :3, 3])
+    assert torch.equal(big.train.cameras.centers, 10 * original[:, :3, 3])
     turned = corruptions.add_pose_noise(scene, 0, 5.0).train.cameras.c2w[:, :3, :3]
     traces = (turned.mT @ original[:, :3, :3]).diagonal(dim1=1, dim2=2).sum(1)
     degrees = ((traces - 1) / 2).clamp(-1, 1).acos() * 180 / math.pi
     assert float(degrees.square().mean().sqrt()) == pytest.approx(5.0, rel=0.4)
-    moved = corruptions.add_pose_noise(scene, 0, 0.0, 0.05).train.cameras.centres - original[:, :3, 3]
+    moved = corruptions.add_pose_noise(scene, 0, 0.0, 0.05).train.cameras.centers - original[:, :3, 3]
     assert float(moved.square().sum(1).mean().sqrt()) == pytest.approx(0.05 * CAMERA_DISTANCE, rel=0.4)
     assert int((corruptions.swap_poses(scene, 0, 3).train.cameras.c2w != original).flatten(1).any(1).sum()) == 3
     longer = corruptions.scale_focal_length(scene, 0, 1.1)
@@ -84,7 +84,7 @@ def test_corruptions_of_poses_and_bounds_have_their_size():
     assert torch.equal(scene.train.cameras.c2w, original), "the scene itself is untouched"
 
 
-def test_corruptions_of_colours_have_their_size():
+def test_corruptions_of_colors_have_their_size():
     scene = make_object_scene(PILE, None, size=16)
     plain, held_out = scene.train.images.float(), scene.val.images.float()
     gains = corruptions.vary_exposure(scene, 0, 0.3).train.images[..., :3].float().sum((1, 2, 3))

@@ -52,7 +52,7 @@ class Slab(Field):
     def features(self, positions: Tensor) -> tuple[Tensor, Tensor]:
         return 1e6 * ((positions[:, 2] > 0.5) & (positions[:, 0] > 0)).float(), positions
 
-    def colour(self, features: Tensor, directions: Tensor) -> Tensor:
+    def color(self, features: Tensor, directions: Tensor) -> Tensor:
         return self.red.expand(len(features), 3)
 
 
@@ -99,7 +99,7 @@ def test_diagnose_constant_field_names_cause(sunset: PictureBatch):
     field = PictureMLP((20, 20), width=16)
     assert NeRF2D(field, ADAM_FACTORY, constant).diagnose(sunset) == ""
     field.net[-1].bias.data += 100  # saturates
-    assert "same colour" in NeRF2D(field, ADAM_FACTORY, constant).diagnose(sunset)
+    assert "same color" in NeRF2D(field, ADAM_FACTORY, constant).diagnose(sunset)
 
 
 class Wave(PictureField):
@@ -111,7 +111,7 @@ class Wave(PictureField):
 
 def test_measure_off_grid_psnr_wave_matches_closed_form(sunset):
     system = NeRF2D(Wave((20, 20)), ADAM_FACTORY, constant)
-    # Neighbouring samples of the wave differ by 18 degrees: their mean falls short of it by 1 - cos(9 degrees).
+    # Neighboring samples of the wave differ by 18 degrees: their mean falls short of it by 1 - cos(9 degrees).
     expected = -10 * math.log10((0.4 * (1 - math.cos(math.radians(9)))) ** 2 / 2)
     found = system.measure_off_grid_psnr(PictureBatch(sunset.uv, system.query_rgb(sunset.uv), 20, 20))
     assert found == pytest.approx(expected, abs=0.3)

@@ -13,7 +13,7 @@ from nerf_lightning.utils.option_checks import Ge, Gt, Le, Lt, check_options
 def target(
     seconds: float | None = None,
     steps: int = 1,
-    colour: str | list[float] = "scene",
+    color: str | list[float] = "scene",
     share: Annotated[float, Ge(0), Le(1)] = 0.5,
     decay: Annotated[float, Gt(0), Lt(1)] = 0.5,
 ) -> None:
@@ -21,16 +21,14 @@ def target(
 
 
 def test_check_options_finite_numbers_within_bounds_pass():
-    check_options(
-        "group", target, {"seconds": 3.4e38, "steps": 2**63 - 1, "colour": [0.5, 1], "share": 1, "decay": 0.9}
-    )
+    check_options("group", target, {"seconds": 3.4e38, "steps": 2**63 - 1, "color": [0.5, 1], "share": 1, "decay": 0.9})
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         ({"seconds": math.nan}, "group.seconds: found nan, expected a number or null"),
-        ({"colour": [math.inf]}, "group.colour"),
+        ({"color": [math.inf]}, "group.color"),
         ({"steps": 2**63}, "group.steps.*a whole number"),
         ({"steps": "many"}, "group.steps"),
         ({"share": 1.5}, "group.share: found 1.5, expected a number at least 0 and at most 1"),

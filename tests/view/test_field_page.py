@@ -19,7 +19,7 @@ from nerf_lightning.runs.folder import load_run
 from nerf_lightning.training.train import train
 from nerf_lightning.view.field_page import ClientState, FieldPage
 from nerf_lightning.view.progressive import ProgressiveRenderer, ViewRequest
-from tests.helpers.ball_runs import CENTRE, RADIUS, make_ball_system
+from tests.helpers.ball_runs import CENTER, RADIUS, make_ball_system
 
 UP = torch.tensor([0.0, 0.0, 1.0])
 BLUE = (0.0, 0.0, 1.0)
@@ -27,11 +27,11 @@ BLUE = (0.0, 0.0, 1.0)
 
 def orbit() -> Cameras:
     K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
-    return Cameras.pinhole(K.repeat(4, 1, 1), make_circle_poses(CENTRE, UP, 3.0, 0.3, 4), 32, 24)
+    return Cameras.pinhole(K.repeat(4, 1, 1), make_circle_poses(CENTER, UP, 3.0, 0.3, 4), 32, 24)
 
 
 def make_request(**changes: Any) -> ViewRequest:
-    c2w = look_at(CENTRE + torch.tensor([3.0, 0, 0]), CENTRE, UP).double().numpy()
+    c2w = look_at(CENTER + torch.tensor([3.0, 0, 0]), CENTER, UP).double().numpy()
     given = {"c2w": c2w, "fov": 0.8, "aspect": 1.5, "channel": "rgb", "background": BLUE, "near": 0.0, "far": math.inf}
     return ViewRequest(**{**given, "max_side": 60, **changes})
 

@@ -19,7 +19,7 @@ from nerf_lightning.view.geometry import (
 )
 
 
-def off_centre(views: Views) -> Views:
+def off_center(views: Views) -> Views:
     """The same photos through a lens whose axis meets them 2 pixels right of and 4 above the middle; no square pixels."""
     K = torch.tensor([[20.0, 0.0, 10.0], [0.0, 25.0, 4.0], [0.0, 0.0, 1.0]])
     return replace(views, cameras=replace(views.cameras, K=K.expand_as(views.cameras.K)))
@@ -43,11 +43,11 @@ def pixel_of(cameras: Cameras, view: int, rays: Rays) -> torch.Tensor:
     return projected[:, :2] / projected[:, 2:]
 
 
-def test_sample_random_rays_pass_through_pixel_centres(scene: Scene):
-    cameras = off_centre(scene.train).cameras
+def test_sample_random_rays_pass_through_pixel_centers(scene: Scene):
+    cameras = off_center(scene.train).cameras
     views = torch.arange(len(cameras)).repeat_interleave(50)
     rays = sample_random_rays(cameras, views, torch.Generator().manual_seed(0))
-    assert torch.equal(rays.origins, cameras.centres[views])
+    assert torch.equal(rays.origins, cameras.centers[views])
     for view in range(len(cameras)):
         pixels = pixel_of(cameras, view, rays[views == view])
         torch.testing.assert_close(pixels - 0.5, (pixels - 0.5).round(), atol=1e-4, rtol=0)
@@ -77,7 +77,7 @@ def test_get_overview_viewpoint_sees_cameras_and_box(scene: Scene):
     ahead = view.look_at - view.position
     ahead /= np.linalg.norm(ahead)
     np.testing.assert_allclose(view.up, [0, 0, 1], atol=1e-5)
-    for point in torch.cat([scene.train.cameras.centres, scene.val.cameras.centres, scene.bounds.aabb]).numpy():
+    for point in torch.cat([scene.train.cameras.centers, scene.val.cameras.centers, scene.bounds.aabb]).numpy():
         toward = point - view.position
         assert toward @ ahead / np.linalg.norm(toward) >= math.cos(view.fov / 2) - 1e-6
 
@@ -85,9 +85,9 @@ def test_get_overview_viewpoint_sees_cameras_and_box(scene: Scene):
 def test_get_photo_viewpoint_matches_camera(scene: Scene):
     frustum = next(iterate_frusta(scene.train, 8))
     view = get_photo_viewpoint(frustum, 4.0, np.array([0.0, 0.0, 1.0], np.float32))
-    right, down, ahead, centre = scene.train.cameras.c2w[0, :3].T.numpy()
-    np.testing.assert_allclose(view.position, centre)
-    np.testing.assert_allclose(view.look_at, centre + 4 * ahead, rtol=1e-6)
+    right, down, ahead, center = scene.train.cameras.c2w[0, :3].T.numpy()
+    np.testing.assert_allclose(view.position, center)
+    np.testing.assert_allclose(view.look_at, center + 4 * ahead, rtol=1e-6)
     assert abs(view.up @ right) < 1e-6  # no roll
     assert view.up @ down < 0
     np.testing.assert_allclose(get_photo_viewpoint(frustum, 4.0, down).up, -down)  # taken upside down

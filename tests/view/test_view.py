@@ -80,7 +80,7 @@ def test_color_points_use_nearest_photo(scene: Scene):
     views = Views.from_images(images, scene.train.cameras)
     c2w = scene.train.cameras.c2w
     near = c2w[2, :3, 3] + 0.5 * c2w[2, :3, 2]
-    behind = scene.train.cameras.centres.mean(0) + 1e3 * torch.tensor([0.0, 0.0, 1.0])
+    behind = scene.train.cameras.centers.mean(0) + 1e3 * torch.tensor([0.0, 0.0, 1.0])
     points, rgb = color_points(torch.stack([near, behind]), views)
     np.testing.assert_allclose(points[0], near)
     assert rgb.tolist() == [[30] * 3, [128] * 3]

@@ -33,7 +33,7 @@ class Bundle:
     """Tag to world."""
     detections: list[dict[int, TagDetection]]
     twists: Float[np.ndarray, "T"]
-    """Height of each tag's corners above its plane, alternately up and down, metres: paper is seldom flat."""
+    """Height of each tag's corners above its plane, alternately up and down, meters: paper is seldom flat."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def vector_to_lens(lens: Intrinsics, vector: Float[np.ndarray, "9"]) -> Intrinsi
 
 
 def simplify_lens(lens: Intrinsics, free: tuple[str, ...]) -> Intrinsics:
-    """Resets parameters that are not free (square pixels, centred, no distortion); unchanged for ()."""
+    """Resets parameters that are not free (square pixels, centered, no distortion); unchanged for ()."""
     if not free:
         return lens
     defaults = np.array([lens.fx, 1.0, lens.width / 2, lens.height / 2, 0, 0, 0, 0, 0])

@@ -34,7 +34,7 @@ LENS_MODELS: tuple[tuple[int, tuple[str, ...]], ...] = (
 )
 """Photos required by each lens model, and its free parameters; the BIC selects among the models allowed.
 
-With few photos the principal point would absorb bent paper and bias the focal length: it stays in the centre.
+With few photos the principal point would absorb bent paper and bias the focal length: it stays in the center.
 """
 NUM_POSE_ROUNDS = 3
 """Rounds of solving poses before the lens model is selected."""
@@ -159,7 +159,7 @@ def _fit_lens_model(lens: Intrinsics, used: Sequence[PhotoObservation], layout: 
 
 
 def _measure_tilt(observation: PhotoObservation) -> float:
-    """Tilt of the tag nearest to the image centre by its foreshortening, radians, which needs no focal length."""
+    """Tilt of the tag nearest to the image center by its foreshortening, radians, which needs no focal length."""
     middle = np.array([observation.width / 2, observation.height / 2])
     detection = min(observation.detections.values(), key=lambda m: float(np.linalg.norm(m.pixels.mean(0) - middle)))
     flat = np.c_[detection.points[:, :2], np.ones(len(detection.points))]

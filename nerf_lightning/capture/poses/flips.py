@@ -2,7 +2,7 @@
 
 A planar tag seen nearly head-on has two poses of about the same reprojection error, and noise decides between them. But
 viewing directions change little between consecutive photos: each photo's direction is predicted as the weighted mean of its
-neighbours', iteratively, and the spread of the prediction errors sets the prior's weight. Unordered photos predict each other
+neighbors', iteratively, and the spread of the prediction errors sets the prior's weight. Unordered photos predict each other
 badly and keep their best pose.
 """
 
@@ -14,21 +14,21 @@ from jaxtyping import Float
 from nerf_lightning.capture.poses.geometry import invert_pose
 from nerf_lightning.capture.poses.planar_pnp import Hypothesis
 
-NEIGHBOUR_STD_PHOTOS = 1.5, 2.0, 3.0
-"""Standard deviations, in photos, of the neighbours' Gaussian weights; the one that predicts best is used."""
+NEIGHBOR_STD_PHOTOS = 1.5, 2.0, 3.0
+"""Standard deviations, in photos, of the neighbors' Gaussian weights; the one that predicts best is used."""
 NUM_ITERATIONS = 10
 JUMP_PROBABILITY = 0.01
-"""Prior probability that a photo's direction is independent of its neighbours'."""
+"""Prior probability that a photo's direction is independent of its neighbors'."""
 MIN_PHOTOS = 4
 """Fewest photos whose order is used."""
 
 
 def resolve_flips(hypotheses: Sequence[Sequence[Hypothesis]], points: Sequence[Float[np.ndarray, "_ 3"]]) -> list[int]:
-    """Selects each photo's most probable pose, by its reprojection error and the neighbouring photos.
+    """Selects each photo's most probable pose, by its reprojection error and the neighboring photos.
 
     Args:
         hypotheses: at least one for each photo, best first; photos in the order taken.
-        points: world points that each photo shows, metres.
+        points: world points that each photo shows, meters.
 
     Returns:
         The selected index in each list.
@@ -42,11 +42,11 @@ def resolve_flips(hypotheses: Sequence[Sequence[Hypothesis]], points: Sequence[F
         np.exp([(options[0].sum_of_squares - h.sum_of_squares) / (2 * variance) for h in options])
         for options in hypotheses
     ]
-    centre = np.median([visible_points.mean(0) for visible_points in points], axis=0)
-    offsets = [np.stack([invert_pose(h.pose)[:3, 3] - centre for h in options]) for options in hypotheses]
+    center = np.median([visible_points.mean(0) for visible_points in points], axis=0)
+    offsets = [np.stack([invert_pose(h.pose)[:3, 3] - center for h in options]) for options in hypotheses]
     directions = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in offsets]
     lag = np.subtract.outer(np.arange(len(points)), np.arange(len(points)))
-    kernels = [np.exp(-((lag / width) ** 2) / 2) * (lag != 0) for width in NEIGHBOUR_STD_PHOTOS]
+    kernels = [np.exp(-((lag / width) ** 2) / 2) * (lag != 0) for width in NEIGHBOR_STD_PHOTOS]
     posteriors = [likelihood / likelihood.sum() for likelihood in likelihoods]
     for _ in range(NUM_ITERATIONS):
         means = np.stack([posterior @ each for posterior, each in zip(posteriors, directions, strict=True)])

@@ -40,7 +40,7 @@ def apply_pose(matrix: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"
 def project_points(
     lens: Intrinsics, w2c: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "M 3"]
 ) -> Float[np.ndarray, "M 2"]:
-    """Projects world points through a lens; pixel centres at +0.5."""
+    """Projects world points through a lens; pixel centers at +0.5."""
     camera_points = apply_pose(w2c, points)[:, None]
     pixels, _ = cv2.projectPoints(camera_points, np.zeros(3), np.zeros(3), lens.K, lens.opencv_distortion)
     return np.asarray(pixels).reshape(-1, 2)
@@ -49,5 +49,5 @@ def project_points(
 def normalize_pixels(lens: Intrinsics, pixels: Float[np.ndarray, "M 2"]) -> Float[np.ndarray, "M 2"]:
     """Undistorts pixels to normalized coordinates x / z, y / z in the camera frame."""
     coefficients = torch.tensor([lens.distortion], dtype=torch.float64)
-    centred = (pixels - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
-    return undistort(torch.from_numpy(centred), coefficients).numpy()
+    centered = (pixels - [lens.cx, lens.cy]) / [lens.fx, lens.fy]
+    return undistort(torch.from_numpy(centered), coefficients).numpy()

@@ -79,7 +79,7 @@ class RegisteredPhoto:
     reason: str = ""
     """Why it was excluded; "" if it was registered."""
     c2w: Pose | None = None
-    """OpenCV frame, metres."""
+    """OpenCV frame, meters."""
     reprojection_px: float | None = None
     """RMS reprojection error."""
     residuals: dict[int, Float[np.ndarray, "_ 2"]] = field(default_factory=dict)
@@ -195,7 +195,7 @@ def select_lens_model(bundle: Bundle, models: Sequence[tuple[str, ...]], fixed: 
     for free in models:
         start = fits[-1].bundle if fits else bundle  # models are nested: each starts from the previous one
         fits.append(adjust_bundle(replace(start, lens=simplify_lens(start.lens, free)), free, fixed))
-    # A polynomial fitted only to the image centre may fold back; the simplest model is the fallback.
+    # A polynomial fitted only to the image center may fold back; the simplest model is the fallback.
     invertible = [fit for fit in fits if fit.bundle.lens.is_invertible()] or fits[:1]
     best = min(invertible, key=lambda fit: fit.bic)
     twisted = adjust_bundle(best.bundle, models[fits.index(best)], fixed, free_twists=True)

@@ -52,7 +52,7 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
     figures = {
         "tags": draw_tag_sheet(folders, lens.width / lens.height),
         "errors": rasterize_figure(plot_errors(folders, capture.calibration)),
-        "cameras": rasterize_figure(plot_camera_map(numbered, capture.scene, collect_tag_corners(capture), "metres")),
+        "cameras": rasterize_figure(plot_camera_map(numbered, capture.scene, collect_tag_corners(capture), "meters")),
     }
     files = [folder / f"{name}.png" for name in figures]
     for figure, file in zip(figures.values(), files, strict=True):
@@ -61,7 +61,7 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
 
 
 def collect_tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
-    """World positions of the tags' corners, metres, by tag id."""
+    """World positions of the tags' corners, meters, by tag id."""
     points = {
         tag: detection.points for photo in capture.photos for tag, detection in photo.observation.detections.items()
     }
@@ -87,9 +87,9 @@ def _draw_bars(axes: Axes, title: str, photos: Sequence[RegisteredPhoto]) -> Non
     axes.axhline(median, color="black", linestyle="--", linewidth=1, label=f"median {median:.2f} px")
     if excluded:
         axes.plot(excluded, [0] * len(excluded), "X", color=VERMILLION, markersize=10, clip_on=False, label="excluded")
-    labelled = subsample_photos(photos, MAX_LABELS)
-    labels = [f"{shorten(replace_missing_glyphs(photos[i].name), 24)}  {i + 1}" for i in labelled]
-    axes.set_xticks([i + 1 for i in labelled], labels, rotation=90, fontsize=9, fontfamily=FONT, parse_math=False)
+    labeled = subsample_photos(photos, MAX_LABELS)
+    labels = [f"{shorten(replace_missing_glyphs(photos[i].name), 24)}  {i + 1}" for i in labeled]
+    axes.set_xticks([i + 1 for i in labeled], labels, rotation=90, fontsize=9, fontfamily=FONT, parse_math=False)
     axes.set_xlim(0.3, len(photos) + 0.7)
     axes.set(title=f"{title}: reprojection error", ylabel="RMS per photo, pixels")
     axes.margins(y=0.12)

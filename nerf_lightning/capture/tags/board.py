@@ -15,7 +15,7 @@ MIN_CORNERS = 6
 
 @dataclass(frozen=True)
 class Board:
-    """A ChArUco board of `columns` x `rows` squares, at least 3 each, of side `square`, metres."""
+    """A ChArUco board of `columns` x `rows` squares, at least 3 each, of side `square`, meters."""
 
     columns: int
     rows: int
@@ -25,11 +25,11 @@ class Board:
 def make_board_detector(dictionary: str, size: float, board: Board) -> Detector:
     """Makes a detector of a ChArUco board, whose inner corners become tag 0.
 
-    The board's frame: origin at its centre, x to the printed right, y to the printed top, z out of the paper.
+    The board's frame: origin at its center, x to the printed right, y to the printed top, z out of the paper.
 
     Args:
         dictionary: OpenCV's name of the tag family.
-        size: side of the tags, metres.
+        size: side of the tags, meters.
 
     Raises:
         InputError: the tags do not fit into the squares, or the family has too few of them.
@@ -46,18 +46,18 @@ def make_board_detector(dictionary: str, size: float, board: Board) -> Detector:
         charuco = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square, size, patterns)
         charuco.setLegacyPattern(legacy)
         detectors.append((cv2.aruco.CharucoDetector(charuco), np.asarray(charuco.getChessboardCorners(), np.float64)))
-    centre = board.square * np.array([board.columns / 2, board.rows / 2, 0])
+    center = board.square * np.array([board.columns / 2, board.rows / 2, 0])
 
-    def detect(grey: UInt8[np.ndarray, "H W"]) -> dict[int, TagDetection]:
+    def detect(gray: UInt8[np.ndarray, "H W"]) -> dict[int, TagDetection]:
         for detector, corners in detectors:
-            pixels, ids, _, _ = detector.detectBoard(grey)
+            pixels, ids, _, _ = detector.detectBoard(gray)
             if ids is None or len(ids) < MIN_CORNERS:
                 continue
             # OpenCV's y points down the print, and its z into the paper.
-            points = (corners[np.asarray(ids).reshape(-1)] - centre) * [1, -1, -1]
+            points = (corners[np.asarray(ids).reshape(-1)] - center) * [1, -1, -1]
             if np.linalg.matrix_rank(points[:, :2] - points[0, :2], tol=board.square / 2) < 2:
                 continue  # collinear corners do not determine a pose
-            # OpenCV puts pixel centres at integers.
+            # OpenCV puts pixel centers at integers.
             return {0: TagDetection(points, np.asarray(pixels, np.float64).reshape(-1, 2) + 0.5)}
         return {}
 

@@ -32,9 +32,9 @@ class TagDetection:
     """Corners of one tag (or board) and their pixels in a photo."""
 
     points: Float[np.ndarray, "M 3"]
-    """In the tag's frame, metres."""
+    """In the tag's frame, meters."""
     pixels: Float[np.ndarray, "M 2"]
-    """Pixel centres at +0.5."""
+    """Pixel centers at +0.5."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class PhotoObservation:
 
 
 Detector = Callable[[UInt8[np.ndarray, "H W"]], dict[int, TagDetection]]
-"""Detects tags in a grey photo, by id."""
+"""Detects tags in a gray photo, by id."""
 
 
 def get_dictionary(name: str) -> "cv2.aruco.Dictionary":
@@ -71,11 +71,11 @@ def get_dictionary(name: str) -> "cv2.aruco.Dictionary":
 def make_tag_detector(dictionary: str, size: float) -> Detector:
     """Makes a detector of single square tags, with corners refined by `cornerSubPix`.
 
-    OpenCV puts pixel centres at integers, so half a pixel is added.
+    OpenCV puts pixel centers at integers, so half a pixel is added.
 
     Args:
         dictionary: OpenCV's name of the tag family.
-        size: side of the black square, metres.
+        size: side of the black square, meters.
     """
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
@@ -84,8 +84,8 @@ def make_tag_detector(dictionary: str, size: float) -> Detector:
     parameters.cornerRefinementMaxIterations = 100
     detector = cv2.aruco.ArucoDetector(get_dictionary(dictionary), parameters)
 
-    def detect(grey: UInt8[np.ndarray, "H W"]) -> dict[int, TagDetection]:
-        corners, ids, _ = detector.detectMarkers(grey)
+    def detect(gray: UInt8[np.ndarray, "H W"]) -> dict[int, TagDetection]:
+        corners, ids, _ = detector.detectMarkers(gray)
         tags = [] if ids is None else [int(i) for i in np.asarray(ids).reshape(-1)]
         duplicates = {tag for tag, count in Counter(tags).items() if count > 1}
         # A tag detected twice is a reflection, a second print or a false positive: both are ambiguous.
@@ -98,8 +98,8 @@ def make_tag_detector(dictionary: str, size: float) -> Detector:
     return detect
 
 
-def read_grey(path: Path) -> UInt8[np.ndarray, "H W"]:
-    """Reads a photo, upright, in grey."""
+def read_gray(path: Path) -> UInt8[np.ndarray, "H W"]:
+    """Reads a photo, upright, in gray."""
     return cv2.cvtColor(read_pixels(path, upright=True)[..., :3], cv2.COLOR_RGB2GRAY)
 
 
@@ -107,8 +107,8 @@ def detect_tags(paths: Sequence[Path], detector: Detector) -> list[PhotoObservat
     """Detects tags in photos, in the given order."""
 
     def observe(path: Path) -> PhotoObservation:
-        grey = read_grey(path)
-        return PhotoObservation(path, grey.shape[1], grey.shape[0], detector(grey))
+        gray = read_gray(path)
+        return PhotoObservation(path, gray.shape[1], gray.shape[0], detector(gray))
 
     with ThreadPoolExecutor(NUM_THREADS) as pool:
         return list(track_progress(pool.map(observe, paths), len(paths), "detecting tags"))
@@ -144,16 +144,16 @@ def guess_dictionary(paths: Sequence[Path], photos: int = 4) -> str:
     """
     reduced = []
     for i in subsample(len(paths), photos):
-        grey = read_grey(paths[i])
-        size = fit_size(grey.shape[1], grey.shape[0], GUESS_SIDE_PX)
-        reduced.append(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
+        gray = read_gray(paths[i])
+        size = fit_size(gray.shape[1], gray.shape[0], GUESS_SIDE_PX)
+        reduced.append(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
     counts = {}
     for name in COMMON_DICTIONARIES:
         # Without error correction, which would turn clutter into tags of the larger families.
         parameters = cv2.aruco.DetectorParameters()
         parameters.errorCorrectionRate = 0.0
         detector = cv2.aruco.ArucoDetector(get_dictionary(name), parameters)
-        counts[name] = sum(len(detector.detectMarkers(grey)[0]) for grey in reduced)
+        counts[name] = sum(len(detector.detectMarkers(gray)[0]) for gray in reduced)
     best = max(COMMON_DICTIONARIES, key=counts.__getitem__)
     if not counts[best]:
         problem = f"no tag of a common family in {len(reduced)} of {len(paths)} photos"

@@ -13,10 +13,10 @@ from nerf_lightning.capture.tags.tag_layout import TagLayout
 from nerf_lightning.errors import InputError
 from nerf_lightning.utils.files import atomic_write
 
-A4_METRES = 0.210, 0.297
-RULER_METRES = 0.1
+A4_METERS = 0.210, 0.297
+RULER_METERS = 0.1
 """Length of the line that verifies the print scale."""
-METRES_PER_INCH = 0.0254
+METERS_PER_INCH = 0.0254
 
 
 def write_sheet_pdf(layout: TagLayout, file: Path) -> None:
@@ -33,7 +33,7 @@ def write_sheet_pdf(layout: TagLayout, file: Path) -> None:
 
 
 def draw_sheet(layout: TagLayout) -> Figure:
-    """Draws a planar layout of tags, centred on an A4 page.
+    """Draws a planar layout of tags, centered on an A4 page.
 
     Raises:
         InputError: the tags do not fit on the page, or are not in the family.
@@ -45,14 +45,14 @@ def draw_sheet(layout: TagLayout) -> Figure:
     corners = np.concatenate([layout.corners(tag)[:, :2] for tag in layout.poses])
     low, high = corners.min(0), corners.max(0)
     margin = layout.size / 6
-    if (high - low + 2 * margin > A4_METRES).any():
+    if (high - low + 2 * margin > A4_METERS).any():
         problem = f"{1000 * (high - low)[0]:.0f} x {1000 * (high - low)[1]:.0f} mm of tags"
         raise InputError("print-tags", "tag_size", problem, "tags that fit an A4 page with a margin", "reduce tag_size")
-    figure = Figure(figsize=(A4_METRES[0] / METRES_PER_INCH, A4_METRES[1] / METRES_PER_INCH))
+    figure = Figure(figsize=(A4_METERS[0] / METERS_PER_INCH, A4_METERS[1] / METERS_PER_INCH))
     axes = figure.add_axes((0, 0, 1, 1))
-    centre = (low + high) / 2
+    center = (low + high) / 2
     axes.set(
-        xlim=centre[0] + np.array([-0.5, 0.5]) * A4_METRES[0], ylim=centre[1] + np.array([-0.5, 0.5]) * A4_METRES[1]
+        xlim=center[0] + np.array([-0.5, 0.5]) * A4_METERS[0], ylim=center[1] + np.array([-0.5, 0.5]) * A4_METERS[1]
     )
     axes.set_axis_off()
     side = patterns.markerSize + 2
@@ -66,7 +66,7 @@ def draw_sheet(layout: TagLayout) -> Figure:
             # The outline hides seams between modules.
             axes.add_patch(Rectangle((x, y), module, module, angle=rotation, color="black", linewidth=0.2))
     text = f"{layout.dictionary}, tags of {100 * layout.size:g} cm. Print without scaling: this line is 10 cm long."
-    bottom = centre[1] - A4_METRES[1] / 2 + 0.009
-    axes.plot(centre[0] + np.array([-0.5, 0.5]) * RULER_METRES, [bottom, bottom], color="black", linewidth=0.8)
-    axes.text(centre[0], bottom + 0.002, text, ha="center", va="bottom", fontsize=7)
+    bottom = center[1] - A4_METERS[1] / 2 + 0.009
+    axes.plot(center[0] + np.array([-0.5, 0.5]) * RULER_METERS, [bottom, bottom], color="black", linewidth=0.8)
+    axes.text(center[0], bottom + 0.002, text, ha="center", va="bottom", fontsize=7)
     return figure

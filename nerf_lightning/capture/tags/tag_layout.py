@@ -17,9 +17,9 @@ SHEETS_FOLDER = Path(__file__).parent / "sheets"
 
 @dataclass(frozen=True)
 class TagLayout:
-    """Tags in the world frame, metres: that of one tag, or of the printed sheet.
+    """Tags in the world frame, meters: that of one tag, or of the printed sheet.
 
-    A tag's frame: origin at the centre of the black square, x to the printed right, y to the printed top, z out of the paper.
+    A tag's frame: origin at the center of the black square, x to the printed right, y to the printed top, z out of the paper.
     """
 
     dictionary: str
@@ -36,13 +36,13 @@ class TagLayout:
 
 
 def flat_pose(x: float, y: float, degrees: float = 0.0) -> Float[np.ndarray, "4 4"]:
-    """Pose of a tag in the plane z = 0, centred at (x, y) and rotated counterclockwise."""
+    """Pose of a tag in the plane z = 0, centered at (x, y) and rotated counterclockwise."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0, x], [s, c, 0, y], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
 
 
 def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
-    """Reads a planar layout: `tags: {id: {x: metres, y: metres, turn: degrees}}`; `turn` is optional.
+    """Reads a planar layout: `tags: {id: {x: meters, y: meters, turn: degrees}}`; `turn` is optional.
 
     Args:
         path: a YAML file, or the name of one in the package ("sheet_2x3").
@@ -57,13 +57,13 @@ def read_layout(path: Path, dictionary: str, size: float) -> TagLayout:
     content = read_yaml(path, "a file with tags: {0: {x: 0.0, y: 0.0}}")
     tags = content.get("tags") if isinstance(content, dict) else None
     if not isinstance(tags, dict) or not tags:
-        raise InputError(path, "tags", repr(tags), "a mapping from each tag's id to its x and y in metres")
+        raise InputError(path, "tags", repr(tags), "a mapping from each tag's id to its x and y in meters")
     poses = {}
     for tag, entry in tags.items():
         given = {"turn": 0.0} | (entry if isinstance(entry, dict) else {})
         is_number = [type(number) in (int, float) and abs(number) <= MAX_COORDINATE for number in given.values()]
         if type(tag) is not int or tag < 0 or set(given) != {"x", "y", "turn"} or not all(is_number):
-            expected = "an id with x and y in metres, and optionally turn in degrees"
+            expected = "an id with x and y in meters, and optionally turn in degrees"
             raise InputError(path, f"tags.{tag}", repr(entry), expected)
         poses[tag] = flat_pose(given["x"], given["y"], given["turn"])
     return TagLayout(dictionary, size, poses)

@@ -14,7 +14,7 @@ from nerf_lightning.utils.memory import check_memory
 log = logging.getLogger(__name__)
 
 BYTES_PER_RENDERED_PIXEL = 20
-"""Memory per rendered pixel: colour, depth and opacity as float32."""
+"""Memory per rendered pixel: color, depth and opacity as float32."""
 RIGID_TOLERANCE = 1e-3
 """Largest deviation of R^T R from the identity, per entry; files with six digits are well below."""
 MAX_COORDINATE, MIN_CAMERA_DISTANCE = 1e12, 1e-12
@@ -24,8 +24,8 @@ MAX_FOCAL_PX = 2.0**23
 """Largest focal length and pixel coordinate: beyond it float32 cannot resolve pixels."""
 FLOAT32_EPS = 2.0**-23
 """Relative spacing of float32 numbers."""
-MIN_CENTRE_RATIO, MAX_ASPECT_ERROR = 1.8, 0.25
-"""Minimum ratio of the principal point to the image centre, about equal on both axes, that indicates another photo size."""
+MIN_CENTER_RATIO, MAX_ASPECT_ERROR = 1.8, 0.25
+"""Minimum ratio of the principal point to the image center, about equal on both axes, that indicates another photo size."""
 
 
 def require_keys(where: object, have: Iterable[str], needed: Sequence[str]) -> None:
@@ -144,7 +144,7 @@ def check_intrinsics(where: object, key: str, value: Any, width: int, height: in
         expected = f"focal lengths of at least {least:.2g} pixels, and no number above {MAX_FOCAL_PX:.0f}"
         raise InputError(where, key, str(K.tolist()), expected, "are they in pixels?")
     ratio_x, ratio_y = 2 * K[0, 2] / width, 2 * K[1, 2] / height
-    if min(ratio_x, ratio_y) > MIN_CENTRE_RATIO and abs(ratio_x / ratio_y - 1) < MAX_ASPECT_ERROR:
+    if min(ratio_x, ratio_y) > MIN_CENTER_RATIO and abs(ratio_x / ratio_y - 1) < MAX_ASPECT_ERROR:
         found = f"{K[0, 2]:g}, {K[1, 2]:g}, the middle of photos {ratio_x:.3g} times the size {width}x{height}"
         raise InputError(where, key, found, "intrinsics of these photos", "give w and h of the calibrated photos")
     return K

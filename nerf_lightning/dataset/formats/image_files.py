@@ -148,7 +148,7 @@ def read_exposure(path: Path) -> float | None:
 
 
 def read_pixels(path: Path, upright: bool = False, size: tuple[int, int] | None = None) -> UInt8[np.ndarray, "H W C"]:
-    """Decodes one image: RGB, or RGBA with straight alpha; 16 bits become 8, grey becomes RGB.
+    """Decodes one image: RGB, or RGBA with straight alpha; 16 bits become 8, gray becomes RGB.
 
     Args:
         path: PNG, JPEG, TIFF, another format of Pillow, or HEIC.

@@ -22,7 +22,7 @@ PHOTO_FOLDERS = ("images", "images_2", "images_4", "images_8", "")
 def load_llff(folder: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
     """Reads poses_bounds.npy and its photos, sorted by name.
 
-    A row has a pose of 3 x 5 numbers (rotation with columns down, right, backward; centre; height, width and focal length in
+    A row has a pose of 3 x 5 numbers (rotation with columns down, right, backward; center; height, width and focal length in
     pixels), then the nearest and farthest depth.
 
     Args:

@@ -41,7 +41,7 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = DE
         focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which takes precedence.
         near, far: distances along the rays, and aabb: (2, 3), world units, with unbounded: whether content lies outside aabb
             too; without aabb the photos are classified, see `classify_scene`.
-        background: (3,), sRGB; defaults to the uniform border colour of the photos, or black.
+        background: (3,), sRGB; defaults to the uniform border color of the photos, or black.
         to_source: (4, 4), similarity to the frame of the source; defaults to the identity.
 
     Raises:

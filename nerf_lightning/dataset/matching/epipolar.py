@@ -32,7 +32,7 @@ class Matches:
     second: Float[np.ndarray, "M 3"]
     """Unit directions in the two cameras' frames."""
     tolerance: Float[np.ndarray, "M"]
-    """Radians at the centre of the second photo."""
+    """Radians at the center of the second photo."""
     fisheye: Bool[np.ndarray, "M"]
 
     @classmethod
@@ -66,10 +66,16 @@ def unproject(
 def find_inliers(
     matches: Matches, c2w: Float[np.ndarray, "V 4 4"], zoom: float = 1.0, tolerance: float = 1.0
 ) -> Bool[np.ndarray, "M"]:
-    """Epipolar inliers: matches of a point in front of both cameras, at a depth of at least `MIN_DEPTH_BASELINES`.
+    """Mask of epipolar inliers: matches of a point in front of both cameras, at least `MIN_DEPTH_BASELINES` deep.
 
     As its depth varies, a point of the first photo draws an arc of a great circle around the second camera (a single
     direction for coincident cameras). The angle between that arc and the second direction must be within the tolerance.
+
+    Args:
+        matches: of pairs of photos.
+        c2w: poses of all photos, OpenCV.
+        zoom: factor on all focal lengths.
+        tolerance: factor on the tolerance of each match.
     """
     cameras = c2w[matches.views]
     w2c = cameras[:, 1, :3, :3].transpose(0, 2, 1)

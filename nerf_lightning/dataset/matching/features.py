@@ -36,7 +36,7 @@ class Features:
     """Keypoints and descriptors of a photo, strongest first."""
 
     keypoints: Float[np.ndarray, "F 2"]
-    """Column and row, pixels of the photo; the first pixel's centre is at 0.5."""
+    """Column and row, pixels of the photo; the first pixel's center is at 0.5."""
     descriptors: Float[Tensor, "F D"]
     """RootSIFT (Arandjelovic and Zisserman 2012) and sRGB in [0, 1], which distinguishes points that differ in color only."""
 
@@ -84,7 +84,7 @@ def detect_features(views: Views, view: int) -> Features:
 
 
 def match_features(first: Features, second: Features) -> Float[np.ndarray, "M 2 2"]:
-    """Matches mutual nearest neighbours that pass Lowe's ratio test."""
+    """Matches mutual nearest neighbors that pass Lowe's ratio test."""
     if min(len(first.keypoints), len(second.keypoints)) < 2:
         return np.zeros((0, 2, 2))
     distance = torch.cdist(first.descriptors, second.descriptors)
@@ -109,9 +109,9 @@ def find_pairs(features: Sequence[Features], cameras: Cameras) -> list[Pair]:
     """Matches photos that seem to overlap, by coarse matches or by similar poses."""
     counts = count_matches(features)
     by_photo = np.argsort(-counts, axis=1, kind="stable")[:, :PARTNERS_BY_PHOTO]
-    centres, axes = cameras.centres, cameras.c2w[:, :3, 2]
-    spread = (centres - centres.mean(0)).norm(dim=1).mean().clamp_min(1e-12)
-    distance = (torch.cdist(centres, centres) / spread + torch.cdist(axes, axes)).numpy()
+    centers, axes = cameras.centers, cameras.c2w[:, :3, 2]
+    spread = (centers - centers.mean(0)).norm(dim=1).mean().clamp_min(1e-12)
+    distance = (torch.cdist(centers, centers) / spread + torch.cdist(axes, axes)).numpy()
     by_pose = np.argsort(distance, axis=1, kind="stable")[:, 1 : 1 + PARTNERS_BY_POSE]
     candidates = set()
     for view in range(len(cameras)):

@@ -37,30 +37,30 @@ def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
     Args:
         c2w: as read, OpenCV, in the file's world frame.
     """
-    rotation, centre = c2w[:, :3, :3], c2w[:, :3, 3:]
+    rotation, center = c2w[:, :3, :3], c2w[:, :3, 3:]
     transposed = rotation.transpose(0, 2, 1)
-    inverse_centre = -transposed @ centre
+    inverse_center = -transposed @ center
     flips, changes = (np.eye(3), OPENGL_FLIP), list_axis_changes()[1:]
 
-    def suppose(
-        fault: str, hint: str, rotation: Rotations, centre: Float[np.ndarray, "V 3 1"], is_rare: bool = False
+    def make_hypothesis(
+        fault: str, hint: str, rotation: Rotations, center: Float[np.ndarray, "V 3 1"], is_rare: bool = False
     ) -> Hypothesis:
         poses = c2w.copy()
-        poses[:, :3] = np.concatenate([rotation, centre], axis=2)
+        poses[:, :3] = np.concatenate([rotation, center], axis=2)
         return Hypothesis(fault, hint, poses, is_rare=is_rare)
 
     axes = "camera axes of the other convention: OpenCV has y down and z forward, OpenGL y up and z backward"
-    yield suppose(axes, "negate the second and third column of each rotation", rotation @ OPENGL_FLIP, centre)
+    yield make_hypothesis(axes, "negate the second and third column of each rotation", rotation @ OPENGL_FLIP, center)
     inverse = "world-to-camera matrices instead of camera-to-world"
     for flip in flips:
-        yield suppose(inverse, "invert each matrix", transposed @ flip, inverse_centre)
+        yield make_hypothesis(inverse, "invert each matrix", transposed @ flip, inverse_center)
     for left, right in product(flips, repeat=2):
-        fault = "transposed rotations with camera centres"
-        yield suppose(fault, "transpose each rotation", left @ transposed @ right, centre)
+        fault = "transposed rotations with camera centers"
+        yield make_hypothesis(fault, "transpose each rotation", left @ transposed @ right, center)
     for flip in flips:
         fault = "camera-to-world rotations with world-to-camera translations"
-        hint = "put the camera centres -R t in the fourth column"
-        yield suppose(fault, hint, rotation, -rotation @ flip @ centre)
+        hint = "put the camera centers -R t in the fourth column"
+        yield make_hypothesis(fault, hint, rotation, -rotation @ flip @ center)
     for change in changes:
         if np.linalg.det(change) < 0:
             fault = "a mirrored world: left-handed axes, or photos that are flipped"
@@ -70,18 +70,20 @@ def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
             hint = "rotate them; dataset.orientation=exif does so by their EXIF data"
         else:
             fault, hint = "permuted camera axes", "the columns of a rotation are the camera's axes in the world"
-        yield suppose(fault, hint, rotation @ change, centre, is_rare=bool(change[2, 2] != 1))
+        yield make_hypothesis(fault, hint, rotation @ change, center, is_rare=bool(change[2, 2] != 1))
         fault = f"{inverse}, with permuted axes"
-        yield suppose(fault, "invert each matrix", transposed @ change, inverse_centre, is_rare=True)
+        yield make_hypothesis(fault, "invert each matrix", transposed @ change, inverse_center, is_rare=True)
     fault, hint = "quaternions in another order", "the order is w, x, y, z"
     for backward in (False, True):
         for flip in flips:
-            yield suppose(fault, hint, roll_quaternions(rotation @ flip, backward) @ flip, centre)
+            yield make_hypothesis(fault, hint, roll_quaternions(rotation @ flip, backward) @ flip, center)
         rolled = roll_quaternions(transposed, backward).transpose(0, 2, 1)
-        yield suppose(fault, hint, rolled, -rolled @ inverse_centre)  # world-to-camera poses keep their translations
+        yield make_hypothesis(
+            fault, hint, rolled, -rolled @ inverse_center
+        )  # world-to-camera poses keep their translations
     for flip, change in product(flips, changes):
-        fault, hint = "centres and rotations in different world frames", "rotate both to one frame"
-        yield suppose(fault, hint, rotation @ flip, change @ centre, is_rare=True)
+        fault, hint = "centers and rotations in different world frames", "rotate both to one frame"
+        yield make_hypothesis(fault, hint, rotation @ flip, change @ center, is_rare=True)
 
 
 def list_axis_changes() -> list[Float[np.ndarray, "3 3"]]:
@@ -111,18 +113,18 @@ def list_orders(names: Sequence[str], c2w: Poses, indices: Int[np.ndarray, "K"])
     alphabetical = np.array(sorted(range(len(names)), key=lambda i: names[i]))
     numeric = np.array(sorted(range(len(names)), key=lambda i: make_natural_key(names[i])))
 
-    def suppose(fault: str, source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Hypothesis:
+    def make_hypothesis(fault: str, source: Int[np.ndarray, "V"], target: Int[np.ndarray, "V"]) -> Hypothesis:
         poses = c2w.copy()
         poses[target] = c2w[source]
         return Hypothesis(fault, "assign each photo its own pose", poses[indices])
 
     for order in (alphabetical, numeric):
-        for step, neighbour in ((1, "previous"), (-1, "next")):
+        for step, neighbor in ((1, "previous"), (-1, "next")):
             # As read, each photo has the pose of the previous one; so its own is at the next.
-            fault = f"poses shifted by one: each photo has that of the {neighbour} one by name"
-            yield suppose(fault, np.roll(order, -step), order)
-        yield suppose("poses in the reverse order of the photos", order[::-1], order)
+            fault = f"poses shifted by one: each photo has that of the {neighbor} one by name"
+            yield make_hypothesis(fault, np.roll(order, -step), order)
+        yield make_hypothesis("poses in the reverse order of the photos", order[::-1], order)
     fault = "poses in another order than the photos: names sorted as numbers (2, 10) versus text (10, 2)"
     if (alphabetical != numeric).any():
-        yield suppose(fault, alphabetical, numeric)
-        yield suppose(fault, numeric, alphabetical)
+        yield make_hypothesis(fault, alphabetical, numeric)
+        yield make_hypothesis(fault, numeric, alphabetical)

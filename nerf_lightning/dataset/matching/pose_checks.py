@@ -17,7 +17,7 @@ from nerf_lightning.utils.text import join_truncated, subsample
 MAX_TRAIN_PHOTOS, MAX_VAL_PHOTOS = 48, 8
 """Matched photos, evenly spaced."""
 FOCAL_FACTORS = tuple(2.0 ** (step / 8) for step in range(-32, 57) if step)
-"""Focal lengths tried, relative to the file's: values in millimetres are up to a hundred times too short."""
+"""Focal lengths tried, relative to the file's: values in millimeters are up to a hundred times too short."""
 MIN_PAIRS, MIN_MATCHES = 4, 60
 """Pairs and matches needed for any conclusion."""
 MIN_INLIER_RATIO, MAX_INLIER_GAP = 0.1, 0.4
@@ -143,7 +143,7 @@ def fit_focal(matches: Matches, c2w: Poses, focal: float) -> Hypothesis:
     ratios = np.array([compute_inlier_ratio(matches, c2w, zoom, FINE_TOLERANCE) for zoom in FOCAL_FACTORS])
     tied = np.array(FOCAL_FACTORS)[ratios >= TIE_RATIO * ratios.max()]
     zoom = float(np.exp(np.log(tied).mean()))
-    hint = "is it in millimetres, or of reduced photos?" if zoom > 1 else "is it that of larger photos?"
+    hint = "is it in millimeters, or of reduced photos?" if zoom > 1 else "is it that of larger photos?"
     fault = f"a focal length of {focal:.4g} pixels, where about {zoom * focal:.2g} would fit"
     return Hypothesis(fault, hint, c2w, zoom)
 

@@ -40,7 +40,7 @@ def triangulate_matches(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[
     origin = local[:, :3, 3].median(0).values
     local[:, :3, 3] -= origin
     cameras = replace(views.cameras, c2w=local.float())
-    pairs = find_neighbours(local)
+    pairs = find_neighbors(local)
     parts = [torch.zeros(0, 3)]
     for pair in pairs:
         keypoints = match_features(*(detect_features(views, view) for view in pair))
@@ -50,15 +50,15 @@ def triangulate_matches(views: Views, c2w: Float[np.ndarray, "V 4 4"]) -> Float[
     return points.double() + origin
 
 
-def find_neighbours(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
+def find_neighbors(c2w: Float[Tensor, "V 4 4"]) -> list[tuple[int, int]]:
     """Finds pairs spread over the capture: each view with the median-baseline one of similar direction."""
-    axes, centres = normalize(c2w[:, :3, 2], dim=1), c2w[:, :3, 3]
+    axes, centers = normalize(c2w[:, :3, 2], dim=1), c2w[:, :3, 3]
     pairs = set()
     for view in subsample(len(c2w), MAX_PAIRS):
         cosine = axes @ axes[view]
         cosine[view] = -1
         others = (cosine >= min(MIN_AXIS_COSINE, float(cosine.max()))).nonzero()[:, 0]
-        baseline = (centres[others] - centres[view]).norm(dim=1)
+        baseline = (centers[others] - centers[view]).norm(dim=1)
         other = int(others[baseline.argsort()[len(others) // 2]])
         if other != view:
             pairs.add((min(view, other), max(view, other)))
@@ -72,7 +72,7 @@ def triangulate(cameras: Cameras, keypoints: Float[Tensor, "N 2 2"]) -> Float[Te
         @ cameras.c2w[view, :3, :3].double().T
         for view in (0, 1)
     )
-    baseline = (cameras.centres[1] - cameras.centres[0]).double()
+    baseline = (cameras.centers[1] - cameras.centers[0]).double()
     # Least squares for s a - t b = baseline.
     sine = torch.linalg.cross(a, b).norm(dim=1)
     cosine = (a * b).sum(1)
@@ -80,7 +80,7 @@ def triangulate(cameras: Cameras, keypoints: Float[Tensor, "N 2 2"]) -> Float[Te
     t = ((cosine[:, None] * a - b) @ baseline) / sine.square().clamp_min(1e-12)
     farthest = float(baseline.norm()) / MIN_PARALLAX_RAD
     is_far = (sine < MIN_PARALLAX_RAD) | (s <= 0) | (t <= 0) | (s > farthest)
-    points = cameras.centres[0].double() + torch.where(is_far, farthest, s)[:, None] * a
+    points = cameras.centers[0].double() + torch.where(is_far, farthest, s)[:, None] * a
     kept = torch.ones(len(points), dtype=torch.bool)
     for view in (0, 1):
         pixels, _, visible = cameras.project(points.float(), view)

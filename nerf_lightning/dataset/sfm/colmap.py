@@ -38,7 +38,7 @@ MIN_OPENCV_PHOTOS = 6
 MAX_EXHAUSTIVE_PHOTOS = 150
 """Photos up to which matching is exhaustive; sequential beyond."""
 SEQUENTIAL_WINDOW, NUM_LOOP_PHOTOS = 20, 60
-"""Sequential neighbours on either side; and evenly spaced photos that are matched exhaustively for loop closure."""
+"""Sequential neighbors on either side; and evenly spaced photos that are matched exhaustively for loop closure."""
 PAIRS_PER_CALL = 300
 """Pairs per matching call, few enough for a smooth progress bar."""
 MAX_ERROR_FRACTION = 0.004
@@ -46,7 +46,7 @@ MAX_ERROR_FRACTION = 0.004
 MIN_POSE_POINTS = 15
 """Minimum inliers of a pose: five times the minimal set, to exclude chance."""
 MAKE_TAG, MODEL_TAG, FOCAL_TAG, FOCAL_35MM_TAG = 0x010F, 0x0110, 0x920A, 0xA405
-"""EXIF tag ids from which COLMAP derives the focal length, in millimetres."""
+"""EXIF tag ids from which COLMAP derives the focal length, in millimeters."""
 
 
 def reconstruct(photos: Sequence[Path], workspace: Path) -> "pycolmap.Reconstruction | None":
@@ -235,7 +235,7 @@ def _fixed_pose_options(max_error: float) -> "pycolmap.IncrementalPipelineOption
 
 
 def _rescale_model(model: "pycolmap.Reconstruction", photos: Sequence[Path], sizes: Sequence[tuple[int, int]]) -> None:
-    """Rescales a model from the copies to the photos; COLMAP's pixel centres are at +0.5, as ours."""
+    """Rescales a model from the copies to the photos; COLMAP's pixel centers are at +0.5, as ours."""
     scales = {}
     for image in model.images.values():
         number, camera = parse_index(image), model.cameras[image.camera_id]

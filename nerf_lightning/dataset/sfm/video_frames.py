@@ -31,11 +31,11 @@ MAX_FRAMES = 120
 MIN_STEP_FRACTION = 0.01
 """Minimum motion between chosen frames, relative to the longest side, by default."""
 SHARPNESS_WINDOW = 3
-"""Neighbouring frames from which the sharpest is chosen."""
+"""Neighboring frames from which the sharpest is chosen."""
 MIN_MOTION_PX = 0.05
 """Apparent motion caused by noise and compression, in pixels of the small frames."""
 SHARPNESS_SIDE, MOTION_SIDE = 960, 160
-"""Longest sides in pixels of the grey frames for measuring sharpness and motion."""
+"""Longest sides in pixels of the gray frames for measuring sharpness and motion."""
 JPEG_QUALITY = 95
 
 

@@ -11,7 +11,7 @@ const turned = (a, axis, angle) =>          // Rodrigues' rotation
 
 const STEEPEST = 0.995;                     // maximum cosine between ahead and up when turning
 class Camera {
-  // lens: width, height, fx, fy, cx, cy in pixels of the original image; target: centre of rotation.
+  // lens: width, height, fx, fy, cx, cy in pixels of the original image; target: center of rotation.
   constructor(right, down, ahead, eye, lens, target) { Object.assign(this, { right, down, ahead, eye, lens, target }); }
 
   // From a 3 x 4 camera-to-world matrix; the target is the point on the optical axis nearest to the focus.

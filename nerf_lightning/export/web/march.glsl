@@ -12,7 +12,7 @@ uniform float height;                       // pixels: row 0 is at the top, gl_F
 uniform vec4 background;                    // rgb, and 0 where it is transparent
 uniform vec3 keepLow, keepHigh;             // the crop box, unit cube
 uniform vec2 shades;                        // distances shown as white and as black
-uniform int shown;                          // 0 colour, 1 depth, 2 opacity, 3 depth as a number
+uniform int shown;                          // 0 color, 1 depth, 2 opacity, 3 depth as a number
 uniform usampler3D gaps;                    // cells to the nearest occupied one (largest of the three axes), 0 in it
 out vec4 pixel;
 
@@ -54,10 +54,10 @@ void seenAlong(vec3 d) {
 #ifdef PLANES
 // Sums of planes times lines (kernels/vector_matrix.py). Layer m * groups + g holds channels 4g to 4g+3 of mode m; a channel coded
 // as bytes is mapped to [low, low + span] after filtering, as both are linear.
-uniform sampler2DArray densityPlanes, densityLines, colourPlanes, colourLines;
-uniform vec4 densityRanges[4 * DENSITY_GROUPS], colourRanges[4 * COLOUR_GROUPS];   // planes' low, span, lines' low, span
+uniform sampler2DArray densityPlanes, densityLines, colorPlanes, colorLines;
+uniform vec4 densityRanges[4 * DENSITY_GROUPS], colorRanges[4 * COLOR_GROUPS];   // planes' low, span, lines' low, span
 const vec4 network[] = NETWORK;             // constant indices only, so that the compiler inlines the weights
-const int INPUTS = 3 * COLOUR_GROUPS, STRIDE = 1 + TERMS + 4 * INPUTS + 3;         // vec4s for each four neurons
+const int INPUTS = 3 * COLOR_GROUPS, STRIDE = 1 + TERMS + 4 * INPUTS + 3;         // vec4s for each four neurons
 
 vec3 inTexture(vec3 unit, float side) { return (clamp(unit, 0.0, 1.0) * (side - 1.0) + 0.5) / side; }
 vec2 inPlane(vec3 at, int mode) { return mode == 0 ? at.zy : mode == 1 ? at.zx : at.yx; }
@@ -82,10 +82,10 @@ void prepare() {
   EACH_NEURON(ALONG)
 }
 
-vec3 colourAt(vec3 unit) {
-  vec3 at = inTexture(unit, float(COLOUR_SIDE));
+vec3 colorAt(vec3 unit) {
+  vec3 at = inTexture(unit, float(COLOR_SIDE));
   vec4 products[INPUTS];
-#define INPUT(layer) products[layer] = PRODUCT(colourPlanes, colourLines, colourRanges, COLOUR_GROUPS, layer);
+#define INPUT(layer) products[layer] = PRODUCT(colorPlanes, colorLines, colorRanges, COLOR_GROUPS, layer);
   EACH_INPUT(INPUT)
   vec3 logits = network[NEURONS * STRIDE].rgb;
   // A hidden layer with ReLU, four neurons at a time (kernels/mlp.py).
@@ -101,8 +101,8 @@ vec3 colourAt(vec3 unit) {
   return sigmoid(logits);
 }
 #else
-// A sparse voxel grid (kernels/voxels.py) as bricks of 8 x 8 x 8 vertices that share a side with their neighbours: filtering never
-// leaves a brick. Part 0 of the atlas holds log-density and colour, part 1 + b the coefficients of harmonic 1 + b.
+// A sparse voxel grid (kernels/voxels.py) as bricks of 8 x 8 x 8 vertices that share a side with their neighbors: filtering never
+// leaves a brick. Part 0 of the atlas holds log-density and color, part 1 + b the coefficients of harmonic 1 + b.
 uniform usampler3D bricks;                  // position of each brick in the atlas; alpha 0: pruned
 uniform sampler3D atlas;
 uniform vec3 atlasSize;                     // texels
@@ -113,7 +113,7 @@ const int BRICK = 7;
 vec3 brickPlace = vec3(0.0);
 vec4 part(int p) { return ranges[2 * p] + ranges[2 * p + 1] * texture(atlas, (brickPlace + vec3(0, 0, float(p) * partDepth)) / atlasSize); }
 
-vec3 firstColour;
+vec3 firstColor;
 float rawDensity(vec3 unit) {
   vec3 place = clamp(unit, 0.0, 1.0) * float(SIDE - 1);
   ivec3 brick = min(ivec3(place) / BRICK, BRICKS - 1);
@@ -121,14 +121,14 @@ float rawDensity(vec3 unit) {
   if (slot.a == 0u) return -NONE;
   brickPlace = vec3(slot.xyz) * float(BRICK + 1) + place - vec3(brick * BRICK) + 0.5;
   vec4 found = part(0);
-  firstColour = found.gba;
+  firstColor = found.gba;
   return DENSITY_RATE * found.r;
 }
 
 void prepare() {}
 
-vec3 colourAt(vec3 unit) {                  // at the position of the last rawDensity
-  vec3 logits = firstColour;
+vec3 colorAt(vec3 unit) {                  // at the position of the last rawDensity
+  vec3 logits = firstColor;
   for (int b = 1; b <= TERMS; b++) logits += harmonics[b] * part(b).rgb;
   return sigmoid(logits);
 }
@@ -198,7 +198,7 @@ void main() {
     }
     if (any(lessThan(unit, keepLow)) || any(greaterThan(unit, keepHigh))) continue;
     float through = exp(-density(rawDensity(unit)) * (end - start)), weight = light * (1.0 - through);
-    if (weight > LEAST && shown == 0) summed += weight * colourAt(unit);
+    if (weight > LEAST && shown == 0) summed += weight * colorAt(unit);
     if (opacity < 0.5 && opacity + weight >= 0.5) reach = t;   // median depth, as for unbounded scenes
     opacity += weight;
     light *= through;

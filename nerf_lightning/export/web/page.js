@@ -133,10 +133,10 @@ class Page {
       this.camera.approach(Math.exp(Math.max(-0.5, Math.min(0.5, event.deltaY * (event.deltaMode ? 0.05 : 0.0015)))));
       this.changed();
     }, { passive: false });
-    canvas.addEventListener("dblclick", event => this.centre(...this.at(event)));
+    canvas.addEventListener("dblclick", event => this.center(...this.at(event)));
   }
 
-  centre(x, y) {
+  center(x, y) {
     const place = this.renderer.placeAt(this.camera, x, y);
     if (!place) return;
     const to = this.camera.copy(), [fx, fy, cx, cy] = this.camera.lensOn(this.canvas.width, this.canvas.height), depth = dot(add(place, to.eye, -1), to.ahead);

@@ -20,7 +20,7 @@ function makeTexture(gl, target, type, [width, height, depth], data, linear) {
 const each = (name, count) => ({ [`EACH_${name}(F)`]: Array.from({ length: count }, (_, i) => `F(${i})`).join(" ") });
 const typeOf = data => data instanceof Uint8Array ? "bytes" : "halves";
 
-// Chebyshev distance transform (gaps of march.glsl): two passes over the 26 neighbours (Rosenfeld and Pfaltz 1968), exact.
+// Chebyshev distance transform (gaps of march.glsl): two passes over the 26 neighbors (Rosenfeld and Pfaltz 1968), exact.
 function gapsOf(occupied, side) {
   const wide = side + 2, gaps = new Uint8Array(wide ** 3).fill(255), before = [];   // with a margin
   const cells = new Int32Array(side ** 3), found = new Uint8Array(side ** 3);
@@ -58,9 +58,9 @@ function volumeOf(gl, compact, name) {
   return { side, groups: planes.groups, planes: planes.texture, lines: lines.texture, ranges };
 }
 
-// The colour network's weights in the order in which march.glsl reads them.
+// The color network's weights in the order in which march.glsl reads them.
 function networkOf(compact, groups, terms) {
-  const [first, bias, second, last] = ["0.weight", "0.bias", "1.weight", "1.bias"].map(part => compact.floats("field.colour_net." + part));
+  const [first, bias, second, last] = ["0.weight", "0.bias", "1.weight", "1.bias"].map(part => compact.floats("field.color_net." + part));
   const width = bias.length, inputs = first.length / width, channels = (inputs - terms) / 3, row = [];
   const four = of => { for (let i = 0; i < 4; i++) row.push(of(i)); };
   for (let j = 0; j < width; j += 4) {
@@ -68,7 +68,7 @@ function networkOf(compact, groups, terms) {
     four(i => bias[j + i] ?? 0);
     for (let term = 0; term < terms; term++) four(i => weight(i, 3 * channels + term));
     for (let mode = 0; mode < 3; mode++) for (let c = 0; c < 4 * groups; c++) four(i => c < channels ? weight(i, mode * channels + c) : 0);
-    for (let colour = 0; colour < 3; colour++) four(i => j + i < width ? second[colour * width + j + i] : 0);
+    for (let color = 0; color < 3; color++) four(i => j + i < width ? second[color * width + j + i] : 0);
   }
   row.push(...last, 0);
   const vectors = Array.from({ length: row.length / 4 }, (_, i) => `vec4(${row.slice(4 * i, 4 * i + 4).map(number)})`);
@@ -76,15 +76,15 @@ function networkOf(compact, groups, terms) {
 }
 
 function planesOf(gl, compact, about) {
-  const density = volumeOf(gl, compact, "density_volume"), colour = volumeOf(gl, compact, "colour_volume");
-  const { text, neurons } = networkOf(compact, colour.groups, about.terms);
-  const textures = { densityPlanes: density.planes, densityLines: density.lines, colourPlanes: colour.planes, colourLines: colour.lines };
+  const density = volumeOf(gl, compact, "density_volume"), color = volumeOf(gl, compact, "color_volume");
+  const { text, neurons } = networkOf(compact, color.groups, about.terms);
+  const textures = { densityPlanes: density.planes, densityLines: density.lines, colorPlanes: color.planes, colorLines: color.lines };
   return {
     constants: {
-      PLANES: 1, DENSITY_GROUPS: density.groups, COLOUR_GROUPS: colour.groups, DENSITY_SIDE: density.side, COLOUR_SIDE: colour.side, NEURONS: neurons, NETWORK: text,
-      ...each("DENSITY_LAYER", 3 * density.groups), ...each("INPUT", 3 * colour.groups), ...each("TERM", about.terms), ...each("NEURON", neurons),
+      PLANES: 1, DENSITY_GROUPS: density.groups, COLOR_GROUPS: color.groups, DENSITY_SIDE: density.side, COLOR_SIDE: color.side, NEURONS: neurons, NETWORK: text,
+      ...each("DENSITY_LAYER", 3 * density.groups), ...each("INPUT", 3 * color.groups), ...each("TERM", about.terms), ...each("NEURON", neurons),
     },
-    textures, ranges: { densityRanges: density.ranges, colourRanges: colour.ranges },
+    textures, ranges: { densityRanges: density.ranges, colorRanges: color.ranges },
   };
 }
 
@@ -103,13 +103,13 @@ function voxelsOf(gl, compact, about) {
   const size = BRICK + 1, across = Math.max(1, Math.ceil(Math.cbrt(used.length * (1 + terms)))), deep = Math.max(1, Math.ceil(used.length / across ** 2));
   const shape = [across * size, across * size, deep * size * (1 + terms)];
   if (Math.max(...shape) > gl.getParameter(gl.MAX_3D_TEXTURE_SIZE)) throw new Error("This field is too large for this device's graphics.");
-  const tables = ["log_density", "colours", "sh_coefficients"].map(name => compact.stored("field." + name));
+  const tables = ["log_density", "colors", "sh_coefficients"].map(name => compact.stored("field." + name));
   const halves = tables.some(table => table.columns && table.data.length && !(table.data instanceof Uint8Array));
   if (halves) for (const table of tables) if (table.data instanceof Uint8Array) {
     const { low, span, columns } = table;
     Object.assign(table, { data: Uint16Array.from(table.data, (value, i) => toHalf(low[i % columns] + value / 255 * span[i % columns])), low: low.map(() => 0), span: span.map(() => 1) });
   }
-  const [density, colours, views] = tables, texels = new (halves ? Uint16Array : Uint8Array)(shape[0] * shape[1] * shape[2] * 4);
+  const [density, colors, views] = tables, texels = new (halves ? Uint16Array : Uint8Array)(shape[0] * shape[1] * shape[2] * 4);
   const places = new Uint8Array(bricks ** 3 * 4);
   used.forEach(([x, y, z], number) => {
     const slot = [number % across, Math.floor(number / across) % across, Math.floor(number / across ** 2)];
@@ -117,11 +117,11 @@ function voxelsOf(gl, compact, about) {
     each((i, j, k) => {
       const row = vertex(x * BRICK + i, y * BRICK + j, z * BRICK + k);
       const texel = part => 4 * (((slot[2] + part * deep) * size + k) * shape[1] + slot[1] * size + j) * shape[0] + 4 * (slot[0] * size + i);
-      texels.set([density.data[row], colours.data[3 * row], colours.data[3 * row + 1], colours.data[3 * row + 2]], texel(0));
+      texels.set([density.data[row], colors.data[3 * row], colors.data[3 * row + 1], colors.data[3 * row + 2]], texel(0));
       for (let b = 0; b < terms; b++) for (let c = 0; c < 3; c++) texels[texel(1 + b) + c] = views.data[(row * 3 + c) * terms + b];
     });
   });
-  const ranges = [density.low[0], ...colours.low, density.span[0], ...colours.span];
+  const ranges = [density.low[0], ...colors.low, density.span[0], ...colors.span];
   for (let b = 0; b < terms; b++) for (const row of [views.low, views.span]) ranges.push(row[b], row[terms + b], row[2 * terms + b], 0);
   return {
     constants: { SIDE: side, BRICKS: bricks, DENSITY_RATE: number(about.density_lr_scale) },

@@ -8,8 +8,8 @@ from nerf_lightning.kernels.cpu.jit import kernel
 
 
 @kernel
-def forward(density, rgb, t, dt, offsets, colour, opacity, depth, transmittance):
-    """Fills colour [3, R], opacity [R], depth [R], and the transmittance before each sample [N]."""
+def forward(density, rgb, t, dt, offsets, color, opacity, depth, transmittance):
+    """Fills color [3, R], opacity [R], depth [R], and the transmittance before each sample [N]."""
     for ray in prange(len(offsets) - 1):
         optical = 0.0  # float64: sums over a ray exceed float32 precision
         red, green, blue, alpha, distance = 0.0, 0.0, 0.0, 0.0, 0.0
@@ -24,27 +24,25 @@ def forward(density, rgb, t, dt, offsets, colour, opacity, depth, transmittance)
             blue += weight * rgb[2, n]
             alpha += weight
             distance += weight * t[n]
-        colour[0, ray], colour[1, ray], colour[2, ray] = red, green, blue
+        color[0, ray], color[1, ray], color[2, ray] = red, green, blue
         opacity[ray], depth[ray] = alpha, distance
 
 
 @kernel
-def backward(
-    density, rgb, t, dt, offsets, transmittance, grad_colour, grad_opacity, grad_depth, grad_density, grad_rgb
-):
-    """Gradients of density [N] and rgb [3, N] from those of colour [3, R], opacity [R] and depth [R].
+def backward(density, rgb, t, dt, offsets, transmittance, grad_color, grad_opacity, grad_depth, grad_density, grad_rgb):
+    """Gradients of density [N] and rgb [3, N] from those of color [3, R], opacity [R] and depth [R].
 
     With g_i the gradient of weight w_i:  d/d density_i = dt_i (T_{i+1} g_i - sum_{j > i} w_j g_j), computed back to front.
     """
     for ray in prange(len(offsets) - 1):
-        red, green, blue = grad_colour[0, ray], grad_colour[1, ray], grad_colour[2, ray]
+        red, green, blue = grad_color[0, ray], grad_color[1, ray], grad_color[2, ray]
         behind = 0.0
         for n in range(offsets[ray + 1] - 1, offsets[ray] - 1, -1):
             step = density[n] * dt[n]
             after = transmittance[n] * math.exp(-step)
             weight = transmittance[n] * -math.expm1(-step)
-            of_colour = red * rgb[0, n] + green * rgb[1, n] + blue * rgb[2, n]
-            grad_weight = of_colour + grad_opacity[ray] + grad_depth[ray] * t[n]
+            of_color = red * rgb[0, n] + green * rgb[1, n] + blue * rgb[2, n]
+            grad_weight = of_color + grad_opacity[ray] + grad_depth[ray] * t[n]
             grad_density[n] = dt[n] * (after * grad_weight - behind)
             behind += weight * grad_weight
             grad_rgb[0, n], grad_rgb[1, n], grad_rgb[2, n] = weight * red, weight * green, weight * blue

@@ -55,16 +55,16 @@ def interval_start(k, shift, span, step, samples, unbounded):
 
 
 @jit
-def to_unit(x, y, z, centre, half, unbounded):
+def to_unit(x, y, z, center, half, unbounded):
     """`Bounds.to_unit` of one position."""
     if not unbounded:
         two = float32(2)
         return (
-            (x - (centre[0] - half[0])) / (two * half[0]),
-            (y - (centre[1] - half[1])) / (two * half[1]),
-            (z - (centre[2] - half[2])) / (two * half[2]),
+            (x - (center[0] - half[0])) / (two * half[0]),
+            (y - (center[1] - half[1])) / (two * half[1]),
+            (z - (center[2] - half[2])) / (two * half[2]),
         )
-    a, b, c = (x - centre[0]) / half[0], (y - centre[1]) / half[1], (z - centre[2]) / half[2]
+    a, b, c = (x - center[0]) / half[0], (y - center[1]) / half[1], (z - center[2]) / half[2]
     norm = max(max(abs(a), abs(b)), max(abs(c), float32(1)))
     scale = float32(2) - float32(1) / norm
     quarter, middle = float32(0.25), float32(0.5)
@@ -105,7 +105,7 @@ def safe_distance(u, cells, empty_blocks, axis):
 
 
 @kernel
-def march(rays, origins, directions, near, far, inside, shift, occupied, resolution, blocks, cells, centre, half, unbounded,
+def march(rays, origins, directions, near, far, inside, shift, occupied, resolution, blocks, cells, center, half, unbounded,
          samples, step, max_intervals, next_interval, intervals, counts):  # fmt: skip
     """Marches rays [A] on: fills intervals [A, max_intervals] with the next occupied intervals and counts [A].
 
@@ -118,9 +118,9 @@ def march(rays, origins, directions, near, far, inside, shift, occupied, resolut
     for n in prange(len(rays)):
         ray = rays[n]
         span, k, kept = ray_span(near, far, inside, ray, half, unbounded), int(next_interval[ray]), 0
-        across = axis_traversal(origins[ray, 0], directions[ray, 0], centre[0], half[0], cells)
-        down = axis_traversal(origins[ray, 1], directions[ray, 1], centre[1], half[1], cells)
-        deep = axis_traversal(origins[ray, 2], directions[ray, 2], centre[2], half[2], cells)
+        across = axis_traversal(origins[ray, 0], directions[ray, 0], center[0], half[0], cells)
+        down = axis_traversal(origins[ray, 1], directions[ray, 1], center[1], half[1], cells)
+        deep = axis_traversal(origins[ray, 2], directions[ray, 2], center[2], half[2], cells)
         tolerance = float32(0.01) + ROUNDING_ERROR * span[1] / step  # in steps
         start = interval_start(k, shift[ray], span, step, samples, unbounded)
         while k <= samples and kept < max_intervals:
@@ -132,7 +132,7 @@ def march(rays, origins, directions, near, far, inside, shift, occupied, resolut
                 continue
             t = (start + end) / float32(2)
             x, y = origins[ray, 0] + t * directions[ray, 0], origins[ray, 1] + t * directions[ray, 1]
-            u, v, w = to_unit(x, y, origins[ray, 2] + t * directions[ray, 2], centre, half, unbounded)
+            u, v, w = to_unit(x, y, origins[ray, 2] + t * directions[ray, 2], center, half, unbounded)
             empty_blocks = int(blocks[cell_number(u, v, w, cells)])
             if empty_blocks > 0:
                 if not unbounded:
@@ -201,8 +201,8 @@ def ray_positions(origins, directions, ray, t, out):
 
 
 @kernel
-def mark_cells(positions, centre, half, unbounded, marks, resolution, value):
+def mark_cells(positions, center, half, unbounded, marks, resolution, value):
     """Writes `value` into the cells at positions [3, N]. Races are benign: all workers write the same value."""
     for n in prange(positions.shape[1]):
-        u, v, w = to_unit(positions[0, n], positions[1, n], positions[2, n], centre, half, unbounded)
+        u, v, w = to_unit(positions[0, n], positions[1, n], positions[2, n], center, half, unbounded)
         marks[cell_number(u, v, w, resolution)] = value

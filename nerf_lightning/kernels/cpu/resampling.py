@@ -16,7 +16,7 @@ def distance(s, span, unbounded):
 
 
 @kernel
-def interval_midpoints(origins, directions, near, far, inside, s, centre, half, unbounded, unit, t, dt):
+def interval_midpoints(origins, directions, near, far, inside, s, center, half, unbounded, unit, t, dt):
     """Fills unit [3, R S], t [R, S] and dt [R, S] from s [R, S + 1]."""
     rays, steps = t.shape
     for ray in prange(rays):
@@ -27,7 +27,7 @@ def interval_midpoints(origins, directions, near, far, inside, s, centre, half, 
             middle = (start + end) / float32(2)
             x, y = origins[ray, 0] + middle * directions[ray, 0], origins[ray, 1] + middle * directions[ray, 1]
             z = origins[ray, 2] + middle * directions[ray, 2]
-            unit[0, n], unit[1, n], unit[2, n] = to_unit(x, y, z, centre, half, unbounded)
+            unit[0, n], unit[1, n], unit[2, n] = to_unit(x, y, z, center, half, unbounded)
             t[ray, k], dt[ray, k] = middle, end - start
             start = end
 

@@ -111,7 +111,7 @@ def find_normal(cylinder, unit):
 
 @jit
 def has_accent(pattern, period, x, y, z, face):
-    """Whether a pattern shows its accent colour at a point (relative to the solid's lower corner) of a face."""
+    """Whether a pattern shows its accent color at a point (relative to the solid's lower corner) of a face."""
     # Face coordinates: u horizontal and v vertical on a side; x and y on top.
     u, v = y if face == 0 else x, y if face == 2 else z
     if pattern == CHEQUER:
@@ -138,14 +138,14 @@ def is_unshadowed(shadow, solid, point):
 
 
 @jit
-def add_colour(solids, shadow, k, point, direction, out):
-    """Adds the sRGB colour of a point on solid k in a unit viewing direction to out [3]: Lambert, ambient, Blinn-Phong."""
-    local, half = transform(solids.axes[k], subtract(point, solids.centre[k])), solids.half_size[k]
+def add_color(solids, shadow, k, point, direction, out):
+    """Adds the sRGB color of a point on solid k in a unit viewing direction to out [3]: Lambert, ambient, Blinn-Phong."""
+    local, half = transform(solids.axes[k], subtract(point, solids.center[k])), solids.half_size[k]
     unit = local[0] / half[0], local[1] / half[1], local[2] / half[2]
     local_normal, face = find_normal(solids.is_cylinder[k], unit)
     corner = (local[0] + half[0], local[1] + half[1], local[2] + half[2])
     accent = has_accent(solids.pattern[k], solids.period[k], corner[0], corner[1], corner[2], face)
-    albedo = solids.accent[k] if accent else solids.colour[k]
+    albedo = solids.accent[k] if accent else solids.color[k]
     normal = transform(solids.axes[k].T, local_normal)
     light = normalize(subtract(LIGHT_POSITION, point))
     key = max(dot(normal, light), ZERO) * single(is_unshadowed(shadow, k, point))
@@ -189,7 +189,7 @@ def shade(solids, shadow, K, c2w, solid, depth, rgba, workers):
                         point = (c2w[0, 3] + t * offset[0], c2w[1, 3] + t * offset[1], c2w[2, 3] + t * offset[2])
                         length = single(np.sqrt(x * x + y * y + 1))
                         direction = (offset[0] / length, offset[1] / length, offset[2] / length)
-                        add_colour(solids, shadow, solid[i, j], point, direction, total)
+                        add_color(solids, shadow, solid[i, j], point, direction, total)
                         count += 1
                 # Averaged in sRGB, as the volume renderer composites, over the samples that hit; alpha is their fraction.
                 for channel in range(3):

@@ -75,31 +75,31 @@ def interpolate(values, index, cells, unit, out):
 
 
 @kernel
-def read(density, colour, rows, weights, raw, rgb):
-    """Fills raw [N] from density [V], and rgb [3, N] from colour [V, 3]."""
+def read(density, color, rows, weights, raw, rgb):
+    """Fills raw [N] from density [V], and rgb [3, N] from color [V, 3]."""
     for n in prange(len(raw)):
         s, a, b, c = float32(0), float32(0), float32(0), float32(0)
         for corner in range(8):
             row, weight = rows[n, corner], weights[n, corner]
             s += weight * density[row]
-            a += weight * colour[row, 0]
-            b += weight * colour[row, 1]
-            c += weight * colour[row, 2]
+            a += weight * color[row, 0]
+            b += weight * color[row, 1]
+            c += weight * color[row, 2]
         raw[n], rgb[0, n], rgb[1, n], rgb[2, n] = s, a, b, c
 
 
 @kernel
-def weight_gradient(density, colour, rows, raw, rgb, grad):
+def weight_gradient(density, color, rows, raw, rgb, grad):
     """Fills grad [N, 8], the gradient in the weights, from those of raw [N] and rgb [3, N]."""
     for n in prange(len(raw)):
         s, a, b, c = raw[n], rgb[0, n], rgb[1, n], rgb[2, n]
         for corner in range(8):
             row = rows[n, corner]
-            grad[n, corner] = s * density[row] + a * colour[row, 0] + b * colour[row, 1] + c * colour[row, 2]
+            grad[n, corner] = s * density[row] + a * color[row, 0] + b * color[row, 1] + c * color[row, 2]
 
 
 @kernel
-def add_sh_colour(sh_coefficients, rows, weights, basis, rgb, lanes, workers):
+def add_sh_color(sh_coefficients, rows, weights, basis, rgb, lanes, workers):
     """Adds to rgb [3, N] the interpolated coefficients [V, 3 B] times basis [B, N]; `lanes` is a tuple of length B."""
     samples, terms = rows.shape[0], len(lanes)
     for worker in prange(workers):
@@ -166,7 +166,7 @@ def balance_rows(rows, table, workers):
 
 
 @kernel
-def scatter(grad_density, grad_colour, rows, weights, raw, rgb, workers):
+def scatter(grad_density, grad_color, rows, weights, raw, rgb, workers):
     """Accumulates the gradients [V] and [V, 3] from those of raw [N] and rgb [3, N]."""
     ends = balance_rows(rows, len(grad_density), workers)
     for worker in prange(workers):
@@ -177,9 +177,9 @@ def scatter(grad_density, grad_colour, rows, weights, raw, rgb, workers):
                 row, weight = rows[n, corner], weights[n, corner]
                 if first <= row < last:
                     grad_density[row] += weight * s
-                    grad_colour[row, 0] += weight * a
-                    grad_colour[row, 1] += weight * b
-                    grad_colour[row, 2] += weight * c
+                    grad_color[row, 0] += weight * a
+                    grad_color[row, 1] += weight * b
+                    grad_color[row, 2] += weight * c
 
 
 @jit
@@ -211,7 +211,7 @@ def scatter_sh(grad, rows, weights, basis, rgb, lanes, workers):
 
 @kernel
 def total_variation(values, vertex_of_row, index, side, first, slope, sums, workers):
-    """Fills slope with the summed differences to all neighbours of rows of values [V] from `first` on, and sums [workers] with
+    """Fills slope with the summed differences to all neighbors of rows of values [V] from `first` on, and sums [workers] with
     their squares."""
     rows = len(slope)
     for worker in prange(workers):
@@ -222,9 +222,9 @@ def total_variation(values, vertex_of_row, index, side, first, slope, sums, work
             for axis in range(3):
                 for sign in (-1, 1):
                     if 0 <= coords[axis] + sign < side:
-                        neighbour = index[at + sign * stride[axis]]
-                        if neighbour > 0:
-                            d = value - values[neighbour]
+                        neighbor = index[at + sign * stride[axis]]
+                        if neighbor > 0:
+                            d = value - values[neighbor]
                             difference += d
                             squares += d * d
             slope[n] = difference
