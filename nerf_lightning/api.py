@@ -119,7 +119,7 @@ def load_scene(path: str | Path, resize: int | str | None = AUTO) -> Scene:
     """Loads a scene in any format that the command line takes.
 
     Args:
-        path: an .npz file, a Blender folder, or a nerfstudio / instant-ngp capture.
+        path: a scene of any format in `docs/photos.md`, a folder of photos, or a video.
         resize: longest side in pixels; larger photos are downsampled. "auto": what 90 s of training on this machine's CPU can
             use, 800 pixels at least; None keeps the size.
 
