@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any
 
 import torch
@@ -78,6 +79,18 @@ def multiply_planes(function: Callable[..., Any], side: int, channels: int, coun
     return lambda planes, lines: function(planes, lines, unit), list(volume), ()
 
 
+def run_network(widths: list[int], num_extra: int, num_head: int, count: int) -> Call:
+    parameters = [torch.randn(shape) for i, o in pairwise(widths) for shape in ((o, i), (o,))]
+    x = torch.randn(count, widths[0] - num_extra)
+    x[1, 0] = math.nan
+
+    def call(x: Any, extra: Any, *parameters: Any) -> Any:
+        layers = list(zip(parameters[::2], parameters[1::2], strict=True))
+        return kernels.mlp_heads(x, layers, num_head, extra if num_extra else None)
+
+    return call, [x, torch.randn(count, num_extra), *parameters], (1,)
+
+
 def list_calls() -> dict[str, Call]:
     """All calls by name."""
     torch.manual_seed(3)
@@ -98,5 +111,8 @@ def list_calls() -> dict[str, Call]:
         "plane_line_products": multiply_planes(kernels.plane_line_products, 12, 16, 40),
         "plane_line_products, odd channels": multiply_planes(kernels.plane_line_products, 5, 3, 33),
         "plane_line_sum": multiply_planes(kernels.plane_line_sum, 20, 8, 64),
+        "mlp, one hidden layer": run_network([16, 64, 16], 0, 1, 70),
+        "mlp, two hidden layers": run_network([31, 64, 64, 3], 16, 0, 100),
+        "mlp, odd widths": run_network([60, 24, 3], 12, 2, 5),
         "plane_line_sum, two vertices": multiply_planes(kernels.plane_line_sum, 2, 1, 20),
     }
