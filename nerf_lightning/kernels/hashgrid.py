@@ -167,6 +167,6 @@ def hash_interpolate(
     """
     if has_fast_kernel(tables, unit):
         return _HashInterpolate.apply(tables, unit, resolutions, sizes)
-    if unit.shape[1] == 3 and has_gpu_kernel(tables, unit):
+    if unit.shape[1] == 3 and tables.shape[1].bit_count() == 1 and has_gpu_kernel(tables, unit):
         return gpu.hashgrid.HashInterpolate.apply(tables, unit, resolutions, sizes)
     return hash_interpolate_reference(tables, unit, resolutions, sizes)

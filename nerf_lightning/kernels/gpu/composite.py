@@ -8,7 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerf_lightning.kernels.gpu.launch import kernel
-from nerf_lightning.kernels.gpu.march import empty_buffers, offsets_of_counts
+from nerf_lightning.kernels.gpu.march import pad_buffers
 
 BLOCK = 32
 """Samples of a ray at a time: one per thread of a warp."""
@@ -142,7 +142,7 @@ def count_visible(
     IS_PADDED: tl.constexpr,
     B: tl.constexpr,
 ):
-    """Visible samples of each ray."""
+    """Writes the visible samples of each ray, from the second entry on."""
     ray = tl.program_id(0)
     first = tl.minimum(tl.load(offsets + ray), samples).to(tl.int32)
     last = tl.minimum(tl.load(offsets + ray + 1), samples).to(tl.int32)
@@ -155,13 +155,13 @@ def count_visible(
         count += tl.sum(keep.to(tl.int64))
         depth += tl.sum(own_depth)
         thin += tl.sum(own_thin)
-    tl.store(counts + ray, count)
+    tl.store(counts + 1 + ray, count)
 
 
 @kernel(num_warps=1)
 def write_visible(
     optical_depth, t, dt, offsets, min_depth, kept, depth_out, t_out, dt_out, ray_out,
-    samples, capacity, max_depth, max_dropped, IS_PADDED: tl.constexpr, B: tl.constexpr,
+    rays, samples, capacity, max_depth, max_dropped, IS_PADDED: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """Packs the visible samples, as far as they fit."""
     ray = tl.program_id(0)
@@ -184,6 +184,7 @@ def write_visible(
         next_slot += tl.sum(count)
         depth += tl.sum(own_depth)
         thin += tl.sum(own_thin)
+    pad_buffers(depth_out, t_out, dt_out, ray_out, kept, rays, capacity, B)
 
 
 def filter_visible(
@@ -197,9 +198,9 @@ def filter_visible(
     limits, options = (-math.log(early_stop_eps), max_dropped), {"IS_PADDED": capacity is not None, "B": BLOCK}
     counts = torch.zeros(rays + 1, dtype=torch.int64, device=t.device)
     count_visible((rays,), optical_depth, dt, offsets, min_depth, counts, len(t), *limits, **options)
-    kept = offsets_of_counts(counts)
+    kept = counts.cumsum(0)
     size = int(kept[-1]) if capacity is None else capacity
-    buffers = t.new_zeros(size), *empty_buffers(rays, size, t)
+    buffers = *t.new_empty(3, size).unbind(), torch.empty(size, dtype=torch.int64, device=t.device)
     inputs = optical_depth, t, dt, offsets, min_depth, kept
-    write_visible((rays,), *inputs, *buffers, len(t), size, *limits, **options)
+    write_visible((rays,), *inputs, *buffers, rays, len(t), size, *limits, **options)
     return buffers[0], (*buffers[1:], kept)

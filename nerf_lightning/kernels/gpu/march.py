@@ -38,7 +38,7 @@ def count_steps(
     origins, directions, near, far, shift, center, half_size, occupied, counts, rays, samples, step,
     resolution: tl.constexpr, R: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
-    """Steps of each ray in occupied cells."""
+    """Writes the steps of each ray in occupied cells, from the second entry on."""
     row = tl.program_id(0) * R + tl.arange(0, R)
     ray, is_ray = row[:, None], (row < rays)[:, None]
     ray_near, ray_far = tl.load(near + ray, is_ray, 0.0), tl.load(far + ray, is_ray, 0.0)
@@ -63,7 +63,21 @@ def count_steps(
             is_ray,
         )
         total += tl.sum(keep.to(tl.int64), axis=1)
-    tl.store(counts + row, total, row < rays)
+    tl.store(counts + 1 + row, total, row < rays)
+
+
+@triton.jit
+def pad_buffers(depth_out, t_out, dt_out, ray_out, offsets, rays, capacity, S: tl.constexpr):
+    """Fills this program's part of the unused slots with intervals of length 0 on the last ray."""
+    part = tl.cdiv(capacity, tl.num_programs(0))
+    begin = tl.load(offsets + rays).to(tl.int32) + tl.program_id(0) * part
+    for first in range(0, part, S):
+        i = first + tl.arange(0, S)
+        is_free = (i < part) & (begin + i < capacity)
+        tl.store(depth_out + begin + i, 0.0, is_free)
+        tl.store(t_out + begin + i, 0.0, is_free)
+        tl.store(dt_out + begin + i, 0.0, is_free)
+        tl.store(ray_out + begin + i, tl.zeros([S], tl.int64) + rays - 1, is_free)
 
 
 @kernel()
@@ -103,17 +117,7 @@ def write_steps(
         tl.store(dt_out + slot, dt, fits)
         tl.store(ray_out + slot, (ray + tl.zeros_like(slot)).to(tl.int64), fits)
         next_slot += tl.sum(count, axis=1)
-
-
-def offsets_of_counts(counts: Tensor) -> Tensor:
-    """Exclusive cumulative sum of [.., R + 1] counts, whose last entry is 0, in place."""
-    return counts.cumsum(0).sub_(counts)
-
-
-def empty_buffers(num_rays: int, capacity: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Buffers t, dt and ray; what stays unused holds intervals of length 0 on the last ray."""
-    t, dt = like.new_zeros(2, capacity).unbind()
-    return t, dt, torch.full((capacity,), num_rays - 1, dtype=torch.int64, device=like.device)
+    pad_buffers(t_out, t_out, dt_out, ray_out, offsets, rays, capacity, S)
 
 
 def march(
@@ -135,8 +139,8 @@ def march(
     blocks = {"resolution": resolution, "R": RAYS_PER_PROGRAM, "S": STEPS_PER_BLOCK}
     counts = torch.zeros(count + 1, dtype=torch.int64, device=near.device)
     count_steps(grid, *inputs, counts, count, samples, step, **blocks)
-    offsets = offsets_of_counts(counts)
+    offsets = counts.cumsum(0)
     size = int(offsets[-1]) if capacity is None else capacity
-    buffers = empty_buffers(count, size, near)
+    buffers = *near.new_empty(2, size).unbind(), torch.empty(size, dtype=torch.int64, device=near.device)
     write_steps(grid, *inputs, offsets, *buffers, count, samples, step, size, **blocks)
     return *buffers, offsets
