@@ -115,11 +115,7 @@ def train_corrupted(
     results = nl.train(corrupted, recipe, steps=STEPS, seed=seed, folder=folder, options=options).results
     aligned = results["psnr"] if results["psnr_aligned"] is None else results["psnr_aligned"]
     refined = apply_refined_cameras(corrupted, read_scene_file(folder)).train.cameras
-    figures = {
-        "psnr": results["psnr"],
-        "psnr_aligned": aligned,
-        "step_ms": 1000 * results["train_seconds"] / STEPS,
-    }
+    figures = {"psnr": results["psnr"], "psnr_aligned": aligned, "step_ms": 1000 * results["train_seconds"] / STEPS}
     return (
         figures
         | measure_camera_errors(refined, truth.train.cameras, truth.bounds.center)

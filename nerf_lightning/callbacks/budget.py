@@ -43,10 +43,7 @@ class Budget(L.Callback):
     """
 
     def __init__(
-        self,
-        steps: Count | None = None,
-        seconds: PositiveFloat | None = None,
-        patience: PositiveFloat | None = None,
+        self, steps: Count | None = None, seconds: PositiveFloat | None = None, patience: PositiveFloat | None = None
     ):
         if steps is None and seconds is None:
             raise InputError("budget", "", "no limit on training", hint="give budget.steps=N or budget.seconds=S")

@@ -61,11 +61,7 @@ class Comparison:
 
 
 def write_comparison(
-    runs: Sequence[RunSummary],
-    output: Path,
-    references: pd.DataFrame,
-    within_db: float = 0.5,
-    seconds: float = 15.0,
+    runs: Sequence[RunSummary], output: Path, references: pd.DataFrame, within_db: float = 0.5, seconds: float = 15.0
 ) -> pd.DataFrame:
     """Compares runs; writes compare.html, compare.png and compare.csv, and prints table and advice.
 

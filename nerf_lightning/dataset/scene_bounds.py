@@ -38,10 +38,7 @@ class VoxelProjection(NamedTuple):
 
 
 def estimate_bounds(
-    views: Views,
-    background: tuple[float, float, float],
-    near: float | None = None,
-    far: float | None = None,
+    views: Views, background: tuple[float, float, float], near: float | None = None, far: float | None = None
 ) -> Bounds:
     """Estimates a bounding box of the content, in world units.
 

@@ -110,11 +110,7 @@ def subsample_cameras(data: DataModule, max_views: int = MAX_VISIBILITY_VIEWS) -
 
 
 def compress_system(
-    system: Any,
-    data: DataModule,
-    config: dict[str, Any],
-    max_psnr_drop: float,
-    seen: CellMask | None = None,
+    system: Any, data: DataModule, config: dict[str, Any], max_psnr_drop: float, seen: CellMask | None = None
 ) -> CompactFile:
     """Encodes a system in the fewest bytes within `max_psnr_drop`: first only visible cells, then all.
 

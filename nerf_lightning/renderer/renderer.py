@@ -131,11 +131,7 @@ class VolumeRenderer(torch.nn.Module):
         return RenderOutput(color, opacity, distance, weights, view_residual)
 
     def losses(
-        self,
-        output: RenderOutput,
-        samples: Samples,
-        progress: float,
-        texturelessness: Float[Tensor, "R"] | None = None,
+        self, output: RenderOutput, samples: Samples, progress: float, texturelessness: Float[Tensor, "R"] | None = None
     ) -> dict[str, Float[Tensor, ""]]:
         """Weighted regularization losses by name.
 
