@@ -104,14 +104,12 @@ def diagnose_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> 
     if not finite_views:
         return "collapsed", "no PSNR of held-out views: their renders are not finite, or no pixel is known"
     held_out_psnr = fmean(view["psnr"] for view in finite_views)
-    constant_color_psnr = fmean(view["constant_color_psnr"] for view in finite_views)
-    min_useful_psnr = min(constant_color_psnr + MIN_GAIN_DB, TRIVIAL_SCENE_DB)
+    constant_psnr = fmean(view["constant_color_psnr"] for view in finite_views)
+    min_useful_psnr = min(constant_psnr + MIN_GAIN_DB, TRIVIAL_SCENE_DB)
     view = get_datamodule(trainer).get_held_out_view(0).to(system.device)
     if held_out_psnr < min_useful_psnr:
-        diagnosis = (
-            f"held-out PSNR {held_out_psnr:.2f} dB is no better than a constant color ({constant_color_psnr:.2f} dB)"
-        )
-        return "collapsed", ": ".join(filter(None, (diagnosis, system.diagnose(view))))
+        cause = f"held-out PSNR {held_out_psnr:.2f} dB is no better than a constant color ({constant_psnr:.2f} dB)"
+        return "collapsed", ": ".join(filter(None, (cause, system.diagnose(view))))
     status = "stopped_early" if Budget.find(trainer).progress(trainer.global_step) < 1.0 else "finished"
     trained = [psnr for psnr in evaluation.photo_psnrs if math.isfinite(psnr)]
     if trained and held_out_psnr < min(fmean(trained) - OVERFIT_GAP_DB, GOOD_PSNR_DB):

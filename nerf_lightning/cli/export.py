@@ -14,9 +14,7 @@ Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     Parameter(help="Crop to a box: X Y Z X Y Z of its lower, then upper corner, in the photos' unit."),
 ]
-Resolution = Annotated[
-    GridSize | None, Parameter(help="Cells along the longest side; default: the photos' resolution.")
-]
+Resolution = Annotated[GridSize | None, Parameter(help="Cells on the longest side; default: the photos' resolution.")]
 Threshold = Annotated[
     Annotated[float, Ge(0.001), Le(0.999)] | None,
     Parameter(help="Opacity of a cell at the surface; default: Otsu's method on the histogram."),
@@ -240,9 +238,8 @@ def _write_geometry(
     if kind != "voxels":
         require_extra("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
     loaded = open_scene_run(source, where)
-    volume = sample_volume(
-        loaded, resolution, None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
-    )
+    corners = None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
+    volume = sample_volume(loaded, resolution, corners)
     if kind == "voxels":
         content, words = build_voxels_file(loaded, volume)
     elif kind == "points":

@@ -131,8 +131,6 @@ def scale_costs(axes: Axes, cost: str, values: list[float]) -> None:
 
 
 def add_label(axes: Axes, name: str, x: float, y: float, color: str) -> Text:
-    text = axes.text(
-        x, y, shorten(replace_missing_glyphs(name), 34), color=color, fontsize=8, zorder=6, parse_math=False
-    )
+    text = axes.text(x, y, shorten(replace_missing_glyphs(name), 34), color=color, size=8, zorder=6, parse_math=False)
     text.set_path_effects([withStroke(linewidth=2, foreground="white")])
     return text

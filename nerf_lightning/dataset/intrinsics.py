@@ -54,9 +54,7 @@ def is_invertible(intrinsics: Intrinsics) -> bool:
     lenses = Lenses(torch.tensor([intrinsics.distortion]).float(), torch.tensor([intrinsics.projection]))
     K = torch.from_numpy(intrinsics.K).float()[None]
     cameras = Cameras(K, torch.eye(4)[None], torch.tensor([[intrinsics.width, intrinsics.height]]), lenses)
-    across, down = (
-        torch.linspace(0, side - 1, ROUNDTRIP_GRID).long() for side in (intrinsics.width, intrinsics.height)
-    )
+    across, down = (torch.linspace(0, n - 1, ROUNDTRIP_GRID).long() for n in (intrinsics.width, intrinsics.height))
     row, col = torch.cartesian_prod(down, across).T
     directions = cameras.generate_rays(torch.zeros_like(row), row, col).directions
     pixels, _, _ = cameras.project(directions, 0)

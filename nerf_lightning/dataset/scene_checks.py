@@ -73,10 +73,8 @@ def check_content(scene: Scene) -> Iterator[SceneIssue]:
     if len(views) == 1:
         yield SceneIssue("one photo to train on", is_fatal=True, hint=hint)
     elif len(views.cameras.sizes.unique(dim=0)) == 1:
-        images = views.images
-        if all(
-            float((image.float() - images[0].float()).abs().mean()) < MAX_DUPLICATE_DIFFERENCE for image in images[1:]
-        ):
+        first, *others = views.images
+        if all(float((image.float() - first.float()).abs().mean()) < MAX_DUPLICATE_DIFFERENCE for image in others):
             yield SceneIssue("identical training photos", is_fatal=True, hint=hint)
 
 

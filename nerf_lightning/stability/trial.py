@@ -120,11 +120,8 @@ def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
     if condition.is_2d:
         path = folder / "image.png"
         write_png(path, scene.image.numpy())
-        overrides = [
-            "callbacks.pictures=null",
-            f"dataset.max_side={max(scene.size) // UPSCALE_FACTOR}",
-            f"render.scale={UPSCALE_FACTOR}",
-        ]
+        max_side = max(scene.size) // UPSCALE_FACTOR
+        overrides = ["callbacks.pictures=null", f"dataset.max_side={max_side}", f"render.scale={UPSCALE_FACTOR}"]
     else:
         path = folder / "scene.npz"
         save_npz(scene, path)

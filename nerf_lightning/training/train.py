@@ -186,9 +186,8 @@ def fit(run: TrainingRun, checkpoint: Path | None) -> None:
 
 def has_trained(trainer: L.Trainer, error: BaseException) -> bool:
     """Whether an error came after the start of training, and not from a first step that ran out of memory."""
-    return Budget.find(trainer).state.clock.has_started and not (
-        trainer.global_step == 0 and out_of_memory_error(error)
-    )
+    clock = Budget.find(trainer).state.clock
+    return clock.has_started and not (trainer.global_step == 0 and out_of_memory_error(error))
 
 
 def summarize(run: TrainingRun, results: dict[str, Any]) -> None:

@@ -50,10 +50,8 @@ class ScenePage(Page):
     def _add_controls(self) -> None:
         gui = self.server.gui
         counts = f"{len(self.scene.train)} training cameras (blue), {len(self.scene.val)} held out (orange)"
-        width, height = self.scene.resolution
-        gui.add_markdown(
-            f"{counts}, {width} x {height} pixels. Drag to turn, scroll to zoom; click a camera to look through it."
-        )
+        size = "{} x {} pixels".format(*self.scene.resolution)
+        gui.add_markdown(f"{counts}, {size}. Drag to turn, scroll to zoom; click a camera to look through it.")
         gui.add_button("whole scene").on_click(self.go_home)
         with gui.add_folder("show"):
             for word in ("points", "orbit", "box", "axes"):

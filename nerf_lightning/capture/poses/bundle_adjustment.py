@@ -147,11 +147,8 @@ class BundleProblem:
         self.free[:9] = [name in free_lens for name in LENS_PARAMETERS]
         self.free[first_tag:first_twist] = np.repeat([tag not in fixed_tags for tag in range(len(bundle.tags))], 6)
         self.free[first_twist:] = free_twists
-        detections = [
-            (photo, tag, detection)
-            for photo, by_tag in enumerate(bundle.detections)
-            for tag, detection in by_tag.items()
-        ]
+        by_photo = enumerate(bundle.detections)
+        detections = [(photo, tag, corners) for photo, tags in by_photo for tag, corners in tags.items()]
         counts = [len(detection.pixels) for _, _, detection in detections]
         photo, tag = (np.repeat([entry[i] for entry in detections], counts) for i in (0, 1))
         self.columns = np.column_stack(

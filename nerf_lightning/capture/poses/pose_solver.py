@@ -161,7 +161,7 @@ def solve_poses(
         InputError: no photo can be registered.
     """
     tag_poses = [
-        {tag: estimate_tag_poses(lens, detection) for tag, detection in s.detections.items()} for s in observations
+        {tag: estimate_tag_poses(lens, corners) for tag, corners in s.detections.items()} for s in observations
     ]
     counts = Counter(tag for by_tag in tag_poses for tag, poses in by_tag.items() if poses)
     # Ties go to the smallest id, so that the frame does not depend on the order of photos.
@@ -265,7 +265,6 @@ def drop_outliers(
     remaining = [s for s in observations if s.name not in reasons]
     for i, s in enumerate(remaining):
         if s.name in hidden:
-            remaining[i] = replace(
-                s, detections={tag: detection for tag, detection in s.detections.items() if tag != hidden[s.name]}
-            )
+            visible = {tag: corners for tag, corners in s.detections.items() if tag != hidden[s.name]}
+            remaining[i] = replace(s, detections=visible)
     return remaining, reasons

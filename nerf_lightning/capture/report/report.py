@@ -62,9 +62,7 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
 
 def collect_tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
     """World positions of the tags' corners, meters, by tag id."""
-    points = {
-        tag: detection.points for photo in capture.photos for tag, detection in photo.observation.detections.items()
-    }
+    points = {tag: corners.points for photo in capture.photos for tag, corners in photo.observation.detections.items()}
     return {tag: apply_pose(pose, points[tag]) for tag, pose in capture.solution.tags.items() if tag in points}
 
 
@@ -112,9 +110,7 @@ def _draw_residuals(axes: Axes, title: str, photos: Sequence[RegisteredPhoto], l
 
 def collect_residuals(photos: Sequence[RegisteredPhoto]) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]:
     """Detected corners of all used photos, and their residuals (projected - detected); pixels."""
-    used = [
-        (photo.observation.detections[tag].pixels, rest) for photo in photos for tag, rest in photo.residuals.items()
-    ]
+    used = [(p.observation.detections[tag].pixels, residuals) for p in photos for tag, residuals in p.residuals.items()]
     pixels, residuals = zip(*used, strict=True)
     return np.concatenate(pixels), np.concatenate(residuals)
 

@@ -151,14 +151,12 @@ def fit_focal(matches: Matches, c2w: Poses, focal: float) -> Hypothesis:
 def choose_best_hypothesis(matches: Matches, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, float]:
     """Chooses the first of the best hypotheses, and returns it with its inlier ratio."""
     best, ratio, quality = hypotheses[0], 0.0, 0.0
-    for hypothesis in hypotheses:
+    for h in hypotheses:
         # The finer tolerance separates hypotheses that are nearly equal over the angles of these photos.
-        coarse, fine = (
-            compute_inlier_ratio(matches, hypothesis.c2w, hypothesis.zoom, slack) for slack in (1.0, FINE_TOLERANCE)
-        )
-        score = (coarse + fine) * (RARE_PENALTY if hypothesis.is_rare else 1.0)
+        coarse, fine = (compute_inlier_ratio(matches, h.c2w, h.zoom, slack) for slack in (1.0, FINE_TOLERANCE))
+        score = (coarse + fine) * (RARE_PENALTY if h.is_rare else 1.0)
         if score * TIE_RATIO > quality:
-            best, ratio, quality = hypothesis, coarse, score
+            best, ratio, quality = h, coarse, score
     return best, ratio
 
 

@@ -116,15 +116,13 @@ def register_with_known_poses(
     pycolmap.triangulate_points(start, database, copies, folder, options=options).write_binary(folder)
     models = pycolmap.incremental_mapping(database, copies, output, options, input_path=folder)
     scale = lens.width / camera.width
-    return {
-        parse_index(image): (
-            np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]),
-            scale * _compute_rms_error(image, model),
-        )
-        for model in models.values()
-        for image in model.images.values()
-        if image.has_pose and parse_index(image) not in known and image.num_points3D >= MIN_POSE_POINTS
-    }
+    registered = {}
+    for model in models.values():
+        for image in model.images.values():
+            if image.has_pose and parse_index(image) not in known and image.num_points3D >= MIN_POSE_POINTS:
+                w2c = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+                registered[parse_index(image)] = w2c, scale * _compute_rms_error(image, model)
+    return registered
 
 
 def match_photos(
@@ -209,12 +207,10 @@ def read_lens_tags(photo: Path) -> bytes:
     tags, kept = read_header(photo).tags, Image.Exif()
     try:
         kept.update({tag: str(tags[tag]) for tag in (MAKE_TAG, MODEL_TAG) if tag in tags})
-        if float(tags.get(FOCAL_TAG, 0)) > 0:
-            kept.get_ifd(EXIF_IFD_TAG)[FOCAL_TAG] = IFDRational(
-                Fraction(float(tags[FOCAL_TAG])).limit_denominator(1000)
-            )
-        if float(tags.get(FOCAL_35MM_TAG, 0)) > 0:
-            kept.get_ifd(EXIF_IFD_TAG)[FOCAL_35MM_TAG] = round(float(tags[FOCAL_35MM_TAG]))
+        if (focal := float(tags.get(FOCAL_TAG, 0))) > 0:
+            kept.get_ifd(EXIF_IFD_TAG)[FOCAL_TAG] = IFDRational(Fraction(focal).limit_denominator(1000))
+        if (focal := float(tags.get(FOCAL_35MM_TAG, 0))) > 0:
+            kept.get_ifd(EXIF_IFD_TAG)[FOCAL_35MM_TAG] = round(focal)
         return kept.tobytes()
     except DECODE_ERRORS:
         return b""
