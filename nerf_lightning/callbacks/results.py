@@ -2,7 +2,6 @@
 
 import math
 import platform
-from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from statistics import fmean
@@ -34,12 +33,7 @@ GOOD_PSNR_DB = 30.0
 
 
 def summarize_run(
-    trainer: L.Trainer,
-    system: System,
-    method: str,
-    seed: int,
-    warnings: Sequence[str],
-    error: BaseException | None = None,
+    trainer: L.Trainer, system: System, method: str, seed: int, warnings: list[str], error: BaseException | None = None
 ) -> dict[str, Any]:
     """Content of results.json, with null for what was not measured.
 
@@ -79,7 +73,7 @@ def summarize_run(
         "rays_per_second": round(throughput.rays / budget.seconds, 1) if throughput and budget.seconds else None,
         **evaluation.metrics,
         "curve": collect_quality_curve(trainer),
-        "warnings": list(warnings),
+        "warnings": warnings,
         "plateau": budget.final_plateau,
         "corrections": summarize_corrections(corrections) if corrections and corrections.is_finite else None,
         "recoveries": [asdict(restart) for restart in recovery.recoveries] if recovery is not None else [],

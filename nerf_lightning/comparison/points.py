@@ -113,10 +113,8 @@ def make_record(run: RunSummary) -> dict[str, Any]:
 
 def collect_options(run: RunSummary) -> dict[str, Any]:
     """Options that affect a run's result, by dotted key; its folder if they are unreadable."""
-    plain = {key: value for key, value in run.config.items() if key not in IGNORED_OPTIONS}
-    options = {
-        key: value for key, value in flatten_config(plain).items() if key.rpartition(".")[2] not in IGNORED_NAMES
-    }
+    flat = flatten_config({key: value for key, value in run.config.items() if key not in IGNORED_OPTIONS})
+    options = {key: value for key, value in flat.items() if key.rpartition(".")[2] not in IGNORED_NAMES}
     return options or {"folder": str(run.folder)}
 
 

@@ -66,12 +66,5 @@ def is_invertible(intrinsics: Intrinsics) -> bool:
 
 def make_equirectangular(width: int, height: int) -> Intrinsics:
     """Intrinsics of an equirectangular panorama, 360 x 180 degrees, centered on the optical axis."""
-    return Intrinsics(
-        width,
-        height,
-        fx=width / (2 * math.pi),
-        fy=height / math.pi,
-        cx=width / 2,
-        cy=height / 2,
-        projection=Projection.EQUIRECTANGULAR,
-    )
+    fx, fy, cx, cy = width / (2 * math.pi), height / math.pi, width / 2, height / 2
+    return Intrinsics(width, height, fx, fy, cx, cy, projection=Projection.EQUIRECTANGULAR)

@@ -84,10 +84,8 @@ class Samples:
 
     def _take(self, index: Tensor | slice, ray: Int[Tensor, "M"], offsets: Int[Tensor, "Q"]) -> "Samples":
         """Selects evaluation samples (without proposals); `ray` and `offsets` belong to the selection."""
-        positions, optical_depth = (
-            None if x is None else x[index] for x in (self.cached_positions, self.optical_depth)
-        )
-        return Samples(self.t[index], self.dt[index], ray, offsets, None, positions, optical_depth)
+        positions, depths = (None if x is None else x[index] for x in (self.cached_positions, self.optical_depth))
+        return Samples(self.t[index], self.dt[index], ray, offsets, None, positions, depths)
 
     def merge_low_weight_samples(self) -> "Samples":
         """Merges neighboring samples if one has less than `MIN_SAMPLE_WEIGHT`; no-op if the optical depth is unknown."""

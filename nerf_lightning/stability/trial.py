@@ -126,12 +126,8 @@ def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
         path = folder / "scene.npz"
         save_npz(scene, path)
         overrides = ["dataset=photos", "callbacks.orbit=null"]
-    overrides += [
-        *(method.get_options_for(condition) or []),
-        make_override("dataset.path", path),
-        f"seed={trial.seed}",
-        f"budget.steps={trial.steps}",
-    ]
+    overrides += [*(method.get_options_for(condition) or []), make_override("dataset.path", path)]
+    overrides += [f"seed={trial.seed}", f"budget.steps={trial.steps}"]
     overrides += ["threads=1", "device=cpu"]  # trials are small and run in parallel
     overrides += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.validation=null", "callbacks.checkpoints=null"]
     outcome: dict[str, Any] = {"psnr": None, "status": "failed", "diagnosis": "", "recoveries": 0, "alarm": ""}

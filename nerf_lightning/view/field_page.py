@@ -175,10 +175,9 @@ class FieldPage(Page):
         c2w[:3, :3] = SO3(camera.wxyz).as_matrix()
         c2w[:3, 3] = camera.position
         far = self.far.value if self.far.value < self.far.max else math.inf
-        background = self.backgrounds[self.background.value]
-        return ViewRequest(
-            c2w, camera.fov, camera.aspect, self.channel.value, background, self.near.value, far, self.max_side.value
-        )
+        channel, background = self.channel.value, self.backgrounds[self.background.value]
+        lens = camera.fov, camera.aspect
+        return ViewRequest(c2w, *lens, channel, background, self.near.value, far, self.max_side.value)
 
     def next_client(self) -> ClientState | None:
         """The client with the coarsest image; None if all images have full resolution."""

@@ -47,9 +47,8 @@ def refine_pose(
     lens: Intrinsics, pose: Pose, points: Float[np.ndarray, "M 3"], pixels: Float[np.ndarray, "M 2"]
 ) -> Hypothesis:
     """Refines a pose by Levenberg-Marquardt on the reprojection error."""
-    rotation, translation = cv2.solvePnPRefineLM(
-        points, pixels, lens.K, lens.opencv_distortion, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
-    )
+    start = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
+    rotation, translation = cv2.solvePnPRefineLM(points, pixels, lens.K, lens.opencv_distortion, *start)
     refined = rotvec_to_matrix(rotation.reshape(3), translation.reshape(3))
     candidates = [evaluate_pose(lens, candidate, points, pixels) for candidate in (refined, pose)]
     return min(candidates, key=lambda h: h.sum_of_squares)
@@ -59,9 +58,8 @@ def deduplicate(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best distinct hypotheses, best first."""
     unique: list[Hypothesis] = []
     for candidate in sorted(hypotheses, key=lambda h: h.sum_of_squares):
-        if np.isfinite(candidate.sum_of_squares) and all(
-            angle_between(candidate.pose, kept.pose) > MIN_POSE_DIFFERENCE_RAD for kept in unique
-        ):
+        is_new = all(angle_between(candidate.pose, kept.pose) > MIN_POSE_DIFFERENCE_RAD for kept in unique)
+        if is_new and np.isfinite(candidate.sum_of_squares):
             unique.append(candidate)
     return unique[:MAX_HYPOTHESES]
 
