@@ -22,6 +22,5 @@ def test_train_mixed_precision_learns(model: str, precision: str, tmp_path: Path
     base = PICTURE if model == "hashgrid2d" else SCENE
     small = ["dataset.seed=0", "budget.steps=2", "callbacks=null", "logger=null", f"model={model}"]
     assert precision in PRECISIONS
-    assert math.isfinite(
-        train(compose_config([*base, *small, f"trainer.precision={precision}"], tmp_path), folder=tmp_path)
-    )
+    cfg = compose_config([*base, *small, f"trainer.precision={precision}"], tmp_path)
+    assert math.isfinite(train(cfg, folder=tmp_path))
