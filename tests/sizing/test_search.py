@@ -66,7 +66,7 @@ def test_rightsize_writes_smallest_run_and_experiment(scene: str, tmp_path: Path
 
 def test_rightsize_interrupted_keeps_full_trainings(scene: str, tmp_path: Path, monkeypatch):
     few = ["budget.steps=8", "sampler.resolution=16"]
-    (tmp_path / "ladder.yaml").write_text(yaml.safe_dump({"rungs": RUNGS[:1], "samplers": SAMPLERS[:1]}))
+    (tmp_path / "ladder.yaml").write_text(yaml.safe_dump({"rungs": RUNGS[:2], "samplers": SAMPLERS[:1]}))
     with monkeypatch.context() as patched:
         patched.setattr(search, "compress_system", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
