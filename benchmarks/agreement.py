@@ -35,9 +35,12 @@ SCENE = ("dataset=bricks", "dataset.size=64", "dataset.train_views=40", "dataset
 SMALL_BATCH = ("dataset.samples=8192", "sampler.samples=96")
 """A batch that plain PyTorch processes in some 10 ms on a CPU."""
 IMAGE = ("+experiment=picture", "dataset.max_side=128", "dataset.pixels=2048")
-DISABLED_CALLBACKS = ("snapshots", "orbit", "checkpoints", "progress", "validation")
-DISABLED_IMAGE_CALLBACKS = ("pictures", "upscale")
-"""Callbacks whose output is not needed here."""
+DISABLED = (
+    "~logger",
+    *(f"callbacks.{x}=null" for x in ("snapshots", "orbit", "checkpoints", "progress", "validation")),
+)
+IMAGE_DISABLED = ("callbacks.pictures=null", "callbacks.upscale=null")
+"""The logger, and callbacks whose output is not needed here."""
 MAX_LOSS_DB = 0.3
 """Largest loss of PSNR against the CPU, in the mean over seeds."""
 MAX_SEEDS = 4
@@ -79,10 +82,8 @@ def compute_mismatch_ratio(actual: Tensor, expected: Tensor) -> float:
 def compare_dense(actual: list[Tensor], expected: list[Tensor]) -> tuple[float, float]:
     """Relative error and mismatch ratio of dense outputs, elementwise."""
     pairs = list(zip(actual, expected, strict=True))
-    return (
-        nan_max([compute_relative_error(a, b) for a, b in pairs if b.is_floating_point()]),
-        nan_max([compute_mismatch_ratio(a, b) for a, b in pairs if not b.is_floating_point()]),
-    )
+    errors = [compute_relative_error(a, b) for a, b in pairs if b.is_floating_point()]
+    return nan_max(errors), nan_max([compute_mismatch_ratio(a, b) for a, b in pairs if not b.is_floating_point()])
 
 
 def compare_rows(actual: list[Tensor], expected: list[Tensor]) -> tuple[float, float]:
@@ -153,9 +154,8 @@ def time_case(case: Case, device: torch.device, choice: str) -> float:
 
 def compare_kernel(case: Case, device: torch.device) -> Row:
     """Compares a kernel on a device with the reference on the CPU."""
-    (values, gradients), (expected, expected_gradients) = (
-        run_case(case, *version) for version in ((device, "auto"), (CPU, "reference"))
-    )
+    values, gradients = run_case(case, device, "auto")
+    expected, expected_gradients = run_case(case, CPU, "reference")
     error, mismatch = COMPARISONS[case.kind](values, expected)
     gradient, _ = compare_dense(gradients, expected_gradients)
     problems = []
@@ -190,15 +190,10 @@ def compare_kernels(device: torch.device) -> Rows:
 
 def list_short_trainings() -> dict[str, list[str]]:
     """Overrides for a short training of each method."""
-    disabled, image_disabled = (
-        [f"callbacks.{name}=null" for name in names] for names in (DISABLED_CALLBACKS, DISABLED_IMAGE_CALLBACKS)
-    )
     # The same batch size on every device: a larger one would learn more.
-    common = [f"budget.steps={STEPS}", "limits.batch_scale=1", "~logger", *disabled]
-    return {
-        **{name: [*SCENE, *SMALL_BATCH, f"recipe={name}_medium", *common] for name in METHODS},
-        **{name: [*IMAGE, f"model={name}", *common, *image_disabled] for name in FIELDS},
-    }
+    common = [f"budget.steps={STEPS}", "limits.batch_scale=1", *DISABLED]
+    scenes = {name: [*SCENE, *SMALL_BATCH, f"recipe={name}_medium", *common] for name in METHODS}
+    return scenes | {name: [*IMAGE, f"model={name}", *common, *IMAGE_DISABLED] for name in FIELDS}
 
 
 def train_silently(overrides: list[str], kernels: str, seed: int, device: torch.device, folder: Path) -> float:

@@ -34,6 +34,10 @@ def vary_exposure(scene: Scene, seed: int) -> Scene:
     return corruptions.vary_exposure(scene, seed, 0.3, 0.1)
 
 
+def darken_corners(scene: Scene, seed: int) -> Scene:
+    return corruptions.add_vignetting(vary_exposure(scene, seed), seed, 0.5)
+
+
 def make_pose_noise(degrees: float, shift_std: float) -> Corruption:
     return lambda scene, seed: corruptions.add_pose_noise(scene, seed, degrees, shift_std)
 
@@ -48,17 +52,9 @@ CONDITIONS: dict[str, tuple[int | None, Corruption, list[str]]] = {
     "2 degrees, 3 %": (None, make_pose_noise(2.0, 0.03), []),
     "5 degrees, 5 %": (None, make_pose_noise(5.0, 0.05), []),
     "light": (None, vary_exposure, []),
-    "light, dark corners": (
-        None,
-        lambda s, n: corruptions.add_vignetting(vary_exposure(s, n), n, 0.5),
-        ["refine.vignetting=true"],
-    ),
+    "light, dark corners": (None, darken_corners, ["refine.vignetting=true"]),
     "focal length 3 % too long": (None, lambda s, n: corruptions.scale_focal_length(s, n, 1.03), ["refine.focal=true"]),
-    "both, 3 wrong": (
-        None,
-        lambda scene, seed: corruptions.swap_poses(add_noise_and_exposure(scene, seed), seed, WRONG_POSES),
-        [],
-    ),
+    "both, 3 wrong": (None, lambda s, n: corruptions.swap_poses(add_noise_and_exposure(s, n), n, WRONG_POSES), []),
     "exact, 12 photos": (FEW_PHOTOS, lambda scene, seed: scene, []),
     "both, 12 photos": (FEW_PHOTOS, add_noise_and_exposure, []),
 }
@@ -115,13 +111,6 @@ def train_corrupted(
     results = nl.train(corrupted, recipe, steps=STEPS, seed=seed, folder=folder, options=options).results
     aligned = results["psnr"] if results["psnr_aligned"] is None else results["psnr_aligned"]
     refined = apply_refined_cameras(corrupted, read_scene_file(folder)).train.cameras
-    figures = {
-        "psnr": results["psnr"],
-        "psnr_aligned": aligned,
-        "step_ms": 1000 * results["train_seconds"] / STEPS,
-    }
-    return (
-        figures
-        | measure_camera_errors(refined, truth.train.cameras, truth.bounds.center)
-        | {"misfits": len(results["misfits"])}
-    )
+    figures = {"psnr": results["psnr"], "psnr_aligned": aligned, "step_ms": 1000 * results["train_seconds"] / STEPS}
+    errors = measure_camera_errors(refined, truth.train.cameras, truth.bounds.center)
+    return {**figures, **errors, "misfits": len(results["misfits"])}

@@ -1,6 +1,7 @@
 """Accuracy of captures: poses, lens and tag layout against the truth of synthetic photos."""
 
 import argparse
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,10 @@ from nerf_lightning.dataset.intrinsics import Intrinsics
 
 LENS = Intrinsics(1024, 768, 900.0, 900.0, 520.0, 380.0, Distortion(k1=-0.2, k2=0.05))
 TAG_SIZE = 0.06
+SIX_POSES = {3 * row + col: flat_pose(0.09 * col, -0.09 * row) for row in (0, 1) for col in (0, 1, 2)}
 SHEETS = {
     "one tag": TagLayout("DICT_4X4_50", TAG_SIZE, {0: flat_pose(0, 0)}),
-    "six tags": TagLayout(
-        "DICT_4X4_50", TAG_SIZE, {3 * r + c: flat_pose(0.09 * c, -0.09 * r) for r in (0, 1) for c in (0, 1, 2)}
-    ),
+    "six tags": TagLayout("DICT_4X4_50", TAG_SIZE, SIX_POSES),
 }
 CAMERA_FLAWS = Flaws(blur=0.5, noise=2.0)
 CAPTURES = (("one tag", 40, None), ("six tags", 40, None), ("one tag", 30, 3))
@@ -114,20 +114,15 @@ def count_flips(
 
 def measure_flips(seeds: list[int], count: int = 500) -> list[dict[str, Any]]:
     """Counts flipped poses along all random walks."""
-    return [
-        {
-            "walk": f"{tilt:g} degrees, {pace} photos a turn{', shuffled' if shuffled else ''}",
-            "seed": seed,
-            "photos": count,
-            **count_flips(seed, count, tilt, pace, shuffled=shuffled),
-        }
-        for tilt, pace, shuffled in RANDOM_WALKS
-        for seed in seeds
-    ]
+    rows = []
+    for (tilt, pace, shuffled), seed in itertools.product(RANDOM_WALKS, seeds):
+        walk = f"{tilt:g} degrees, {pace} photos a turn{', shuffled' if shuffled else ''}"
+        flips = count_flips(seed, count, tilt, pace, shuffled=shuffled)
+        rows.append({"walk": walk, "seed": seed, "photos": count, **flips})
+    return rows
 
 
 def measure(args: argparse.Namespace) -> Rows:
     """Measures both tables."""
-    return name_tables(
-        {"flips": measure_flips(args.seeds), "capture": measure_accuracy(args.output / "capture", args.seeds[0])}
-    )
+    accuracy = measure_accuracy(args.output / "capture", args.seeds[0])
+    return name_tables({"flips": measure_flips(args.seeds), "capture": accuracy})

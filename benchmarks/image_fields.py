@@ -41,22 +41,12 @@ def measure(args: argparse.Namespace) -> Rows:
         "ratio": None if seconds is None else course["train_seconds"] / seconds,
     }
     fields = [
-        {
-            "field": name,
-            "seeds": len(results),
-            "seconds": median(run["train_seconds"] for run in results),
-            "psnr": median(run["psnr"] for run in results),
-            "worst": min(run["psnr"] for run in results),
-            "parameters": results[0]["parameters"],
-            "bytes": results[0]["artifact_bytes"],
-        }
-        for name, results in runs.items()
+        {"field": name, **summarize(results), "bytes": results[0]["artifact_bytes"]} for name, results in runs.items()
     ]
     others = [part for part in overrides if not part.startswith("dataset.path=")]
     kinds = [measure_kind(kind, SIZE, others, seeds, output) for kind in KINDS]
-    kinds.append(
-        measure_kind(leaves.__name__, LARGE_SIZE, [*others, f"budget.seconds={LARGE_SECONDS}"], seeds[:1], output)
-    )
+    large_budget = f"budget.seconds={LARGE_SECONDS}"
+    kinds.append(measure_kind(leaves.__name__, LARGE_SIZE, [*others, large_budget], seeds[:1], output))
     return name_tables({"pictures": [race], "2D fields": fields, "kinds of pictures": kinds})
 
 
@@ -68,12 +58,16 @@ def measure_kind(kind: str, size: int, overrides: list[str], seeds: list[int], o
         folder = output / "pictures" / f"{path.stem}_{seed}"
         runs.append(train(FAST_METHOD, [*overrides, f"dataset.path='{path}'"], seed, folder))
         print(f"{path.stem}, seed {seed}: {runs[-1]['psnr']:.2f} dB", flush=True)
+    peak_memory_bytes = max(run["peak_memory_bytes"] for run in runs)
+    return {"picture": path.stem, **summarize(runs), "peak_memory_bytes": peak_memory_bytes}
+
+
+def summarize(runs: list[Run]) -> Row:
+    """Summarizes the runs of all seeds."""
     return {
-        "picture": path.stem,
         "seeds": len(runs),
         "seconds": median(run["train_seconds"] for run in runs),
         "psnr": median(run["psnr"] for run in runs),
         "worst": min(run["psnr"] for run in runs),
         "parameters": runs[0]["parameters"],
-        "peak_memory_bytes": max(run["peak_memory_bytes"] for run in runs),
     }

@@ -107,8 +107,8 @@ def total_variation(values: Tensor, vertex: Tensor, index: Tensor) -> Tensor:
     return kernels.total_variation(values, vertex, index, 1, len(vertex))
 
 
-def hash_interpolate(cells: Sequence[tuple[int, ...]], sizes: list[int], tables: Tensor, unit: Tensor) -> Tensor:
-    return kernels.hash_interpolate(tables, unit, cells, sizes)
+def hash_interpolate(grid: HashGrid, tables: Tensor, unit: Tensor) -> Tensor:
+    return kernels.hash_interpolate(tables, unit, grid.cells, grid.sizes)
 
 
 def make_converging_rays(unbounded: bool) -> tuple[Tensor, ...]:
@@ -155,6 +155,7 @@ def _make_cases() -> dict[str, Case]:
     capacity = 5 * len(t) // 4  # as samplers choose it to avoid a host sync
     packed_into_capacity = tuple(march(False, capacity, *bounded))
     density = 100 * torch.rand(len(t)) ** 3  # some transparent, some opaque
+    optical_depth = density[torch.arange(capacity) % len(t)] * packed_into_capacity[1]
     rgb = torch.rand(3, len(t)).T
     unit = Bounds(aabb).to_unit(kernels.ray_positions(origins, directions, ray, t))[:NUM_SAMPLES]
     view_directions = directions[ray][:NUM_SAMPLES]
@@ -164,11 +165,12 @@ def _make_cases() -> dict[str, Case]:
     flat = [parameter for layer in layers for parameter in (layer.weight, layer.bias)]
     features = torch.rand(15, len(unit)).T
     clear = avoid_kinks(features, harmonics, layers)
-    factors, colors = VectorMatrix(128, 16), VectorMatrix(128, 16)
+    factors, colors = ((x.planes, x.lines) for x in (VectorMatrix(128, 16), VectorMatrix(128, 16)))
     voxels = VoxelField(Bounds(aabb), base_resolution=64, max_resolution=64, stages=1)
     sparsify(voxels)
     rows, weights = kernels.locate_vertices(voxels.index, unit)
-    marks = torch.zeros(GRID_RESOLUTION**3, dtype=torch.int32)
+    gathered, lattice = (rows, weights, harmonics[:, 1:4]), (voxels.log_density, voxels.vertex_of_row, voxels.index)
+    marks, uv = torch.zeros(GRID_RESOLUTION**3, dtype=torch.int32), torch.rand(NUM_SAMPLES, 2)
     return {
         "march": Case(partial(march, False, None), bounded, kind="packed"),
         "march, unbounded": Case(partial(march, True, None), unbounded, kind="packed"),
@@ -176,39 +178,21 @@ def _make_cases() -> dict[str, Case]:
         "ray_positions": Case(kernels.ray_positions, (origins, directions, ray, t)),
         "filter_visible": Case(partial(filter_visible, None), (density * packed[1], *packed), kind="packed"),
         "filter_visible, into capacity": Case(
-            partial(filter_visible, capacity),
-            (density[torch.arange(capacity) % len(t)] * packed_into_capacity[1], *packed_into_capacity),
-            kind="packed",
+            partial(filter_visible, capacity), (optical_depth, *packed_into_capacity), kind="packed"
         ),
         "merge_low_weight": Case(merge_low_weight, (density * packed[1], *packed), kind="packed"),
         "mark_cells": Case(mark_cells, (marks, aabb, kernels.ray_positions(origins, directions, ray, t))),
-        "hash_interpolate": Case(
-            partial(hash_interpolate, grid.cells, grid.sizes), (grid.tables, unit), num_trainable=1
-        ),
-        "hash_interpolate_2d": Case(
-            partial(hash_interpolate, picture.cells, picture.sizes),
-            (picture.tables, torch.rand(NUM_SAMPLES, 2)),
-            num_trainable=1,
-        ),
+        "hash_interpolate": Case(partial(hash_interpolate, grid), (grid.tables, unit), num_trainable=1),
+        "hash_interpolate_2d": Case(partial(hash_interpolate, picture), (picture.tables, uv), num_trainable=1),
         "mlp": Case(mlp, (features.T[:, clear].T, *flat, harmonics.T[:, clear].T), num_trainable=1 + len(flat)),
         "spherical_harmonics": Case(kernels.spherical_harmonics, (view_directions,)),
-        "plane_line_products": Case(
-            kernels.plane_line_products, (factors.planes, factors.lines, unit), num_trainable=2
-        ),
-        "plane_line_sum": Case(kernels.plane_line_sum, (factors.planes, factors.lines, unit), num_trainable=2),
-        "plane_line_sum_and_products": Case(
-            plane_line_sum_and_products,
-            (factors.planes, factors.lines, colors.planes, colors.lines, unit),
-            num_trainable=4,
-        ),
+        "plane_line_products": Case(kernels.plane_line_products, (*factors, unit), num_trainable=2),
+        "plane_line_sum": Case(kernels.plane_line_sum, (*factors, unit), num_trainable=2),
+        "plane_line_sum_and_products": Case(plane_line_sum_and_products, (*factors, *colors, unit), num_trainable=4),
         "locate_vertices": Case(kernels.locate_vertices, (voxels.index, unit), kind="rows"),
         "mark_rows": Case(mark_rows, (voxels.last_read_step, rows)),
-        "interpolate_voxels": Case(
-            kernels.interpolate_voxels, (*voxels.tables, rows, weights, harmonics[:, 1:4]), num_trainable=3
-        ),
+        "interpolate_voxels": Case(kernels.interpolate_voxels, (*voxels.tables, *gathered), num_trainable=3),
         "interpolate_scalar": Case(kernels.interpolate_scalar, (voxels.log_density, voxels.index, unit)),
-        "total_variation": Case(
-            total_variation, (voxels.log_density, voxels.vertex_of_row, voxels.index), num_trainable=1
-        ),
+        "total_variation": Case(total_variation, lattice, num_trainable=1),
         "composite": Case(kernels.composite, (density, rgb, *packed), num_trainable=2),
     }

@@ -104,9 +104,8 @@ def measure_object_size(run: LoadedSceneRun, solution: PoseSolution, layout: Tag
     for axis, name in enumerate("xyz"):
         start, true_start = (largest.bounds[0, axis], low[axis]) if axis < 2 else (0.0, 0.0)  # it stands on the table
         size, true = largest.bounds[1, axis] - start, high[axis] - true_start
-        rows.append(
-            {"axis": name, "true_m": true, "mesh_m": size, "off_percent": 100 * (size / true - 1), "voxel_m": voxel}
-        )
+        row = {"axis": name, "true_m": true, "mesh_m": size, "off_percent": 100 * (size / true - 1)}
+        rows.append({**row, "voxel_m": voxel})
     return rows
 
 
@@ -115,10 +114,9 @@ def measure_capture(seconds: float, output: Path) -> Rows:
     folder = output / "shapes" / "capture"
     layout = SHEETS["six tags"]
     write_capture(folder, layout, LENS, PHOTOS, VIEWS, CAMERA_FLAWS, 0)
-    capture = capture_scene(
-        folder / "calibration", folder / "photos", TAG_SIZE, folder / "scene.npz", max_side=MAX_PHOTO_SIDE
-    )
-    options = [f"dataset.path='{folder}/scene.npz'", f"budget.seconds={CAPTURE_TIME_FACTOR * seconds}"]
+    calibration, photos, scene = folder / "calibration", folder / "photos", folder / "scene.npz"
+    capture = capture_scene(calibration, photos, TAG_SIZE, scene, max_side=MAX_PHOTO_SIDE)
+    options = [f"dataset.path='{scene}'", f"budget.seconds={CAPTURE_TIME_FACTOR * seconds}"]
     trained = train("capture", options, 0, folder / "run")
     rows = measure_object_size(open_scene_run(folder / "run", resolve_device("auto")), capture.solution, layout)
     return [{**row, "psnr": trained["psnr"]} for row in rows]

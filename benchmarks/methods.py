@@ -56,17 +56,14 @@ def summarize(method: str, by_budget: dict[float, list[Run]]) -> Row:
     """
     row: Row = {"method": method, "seeds": min(len(runs) for runs in by_budget.values())}
     for target in TARGETS_DB:
-        times = [
-            censored_median([find_seconds_to_psnr(run["curve"], target) for run in runs]) for runs in by_budget.values()
-        ]
+        seconds = [[find_seconds_to_psnr(run["curve"], target) for run in runs] for runs in by_budget.values()]
+        times = map(censored_median, seconds)
         row[f"seconds_to_{target}_db"] = min((t for t in times if t is not None), default=None)
     for moment in REPORT_SECONDS:
         budget = min((seconds for seconds in by_budget if seconds >= moment), default=None)
         if budget is not None:
-            row[f"db_at_{moment}_s"] = median(
-                max((point for point in run["curve"] if point[0] <= moment + 1), key=lambda point: point[0])[2]
-                for run in by_budget[budget]
-            )
+            curves = [[point for point in run["curve"] if point[0] <= moment + 1] for run in by_budget[budget]]
+            row[f"db_at_{moment}_s"] = median(max(curve, key=lambda point: point[0])[2] for curve in curves)
     runs = by_budget[max(by_budget)]
     row["steps_per_second"] = median(run["steps"] / run["train_seconds"] for run in runs)
     row["rays_per_second"] = median(run["rays_per_second"] for run in runs)

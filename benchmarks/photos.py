@@ -53,9 +53,8 @@ def resize_views(scene: Scene) -> Scene:
     small = thirds[2].cameras.rescale(0.5)
     halved = Views.from_images(render_photos(PILE, small, scene.background), small)
     margin = SIZE // 8
-    return replace(
-        scene, train=concatenate_views([crop_views(thirds[0], 0, margin), crop_views(thirds[1], margin, 0), halved])
-    )
+    cropped = crop_views(thirds[0], 0, margin), crop_views(thirds[1], margin, 0)
+    return replace(scene, train=concatenate_views([*cropped, halved]))
 
 
 def paste_boxes(scene: Scene, seed: int) -> tuple[Scene, Scene]:
@@ -92,23 +91,16 @@ def measure(args: argparse.Namespace) -> Rows:
     plain = replace(make_object_scene(PILE, GRAY, SIZE, VIEWS, HELD_OUT), bounds=bound_primitives(PILE))
     boxes, masks = paste_boxes(plain, args.seeds[0])
     fisheye = replace(plain, train=render_fisheye(VIEWS, 0.0), val=render_fisheye(HELD_OUT, 0.7))
-    scenes = {
-        "one size": plain,
-        "several sizes": resize_views(plain),
-        "boxes": boxes,
-        "boxes, masked": masks,
-        "fisheye": fisheye,
-    }
+    scenes = {"one size": plain, "several sizes": resize_views(plain)}
+    scenes |= {"boxes": boxes, "boxes, masked": masks, "fisheye": fisheye}
     rows: Rows = []
     for name, scene in scenes.items():
         psnrs = []
         for seed in args.seeds:
             print(f"photos: {name}, seed {seed}", flush=True)
             folder = args.output / "photos" / f"{name}_{seed}".replace(" ", "_")
-            psnrs.append(
-                nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=DISABLED_OUTPUTS).psnr
-            )
-        train = scene.train
-        row = {"photos": name, "psnr": fmean(psnrs), "bytes/pixel": train.nbytes / len(train.pixels)}
-        rows.append(row)
+            run = nl.train(scene, steps=STEPS, seed=seed, device="cpu", folder=folder, options=DISABLED_OUTPUTS)
+            psnrs.append(run.psnr)
+        bytes_per_pixel = scene.train.nbytes / len(scene.train.pixels)
+        rows.append({"photos": name, "psnr": fmean(psnrs), "bytes/pixel": bytes_per_pixel})
     return rows

@@ -42,17 +42,13 @@ def measure(args: argparse.Namespace) -> Rows:
     overrides, seconds, output = args.overrides, args.budgets[0], args.output
     scenes, folder = {"sphere": "", "bricks": "bricks", "heap": "", "lego": "lego"}, output / "scenes"
     folder.mkdir(parents=True, exist_ok=True)
-    synthetic: dict[str, list[Primitive]] = {
-        "sphere": [Sphere((0.0, 0.0, 0.0), 0.8, frequency=0.0)],
-        "heap": make_heap(),
-    }
-    for name, primitives in synthetic.items():
+    sphere: list[Primitive] = [Sphere((0.0, 0.0, 0.0), 0.8, frequency=0.0)]
+    for name, primitives in (("sphere", sphere), ("heap", make_heap())):
         scenes[name] = str(folder / f"{name}.npz")
         save_npz(make_object_scene(primitives, size=SIZE, views=VIEWS, held_out=HELD_OUT), Path(scenes[name]))
     options = ["recipe=tensorf_medium", f"budget.seconds={seconds}", "callbacks.orbit=null", *overrides]
     rungs = read_ladder("tensorf").rungs
-    rows: Rows = []
-    sparse_rows: Rows = []
+    rows, sparse_rows = Rows(), Rows()
     for name, scene in scenes.items():
         root = output / "sizes" / name
         choice = rightsize(scene, *options, output=root)
@@ -71,10 +67,8 @@ def measure(args: argparse.Namespace) -> Rows:
     assert isinstance(data, RayDataModule)  # of the last scene
     save_npz(replace(data.scene, train=data.scene.train.subsample(FEW_VIEWS)), path)
     sparse = compose_config([*describe_scene(str(path)), *options], output)
-    for views, run_cfg, result in (
-        (VIEWS, cfg, choice),
-        (FEW_VIEWS, sparse, rightsize(str(path), *options, output=output / "sizes" / path.stem)),
-    ):
+    sparse_choice = rightsize(str(path), *options, output=output / "sizes" / path.stem)
+    for views, run_cfg, result in ((VIEWS, cfg, choice), (FEW_VIEWS, sparse, sparse_choice)):
         chosen = result["full"][str(result["rung"])]
         default = train_full_run(run_cfg, {}, {}, build_data(run_cfg), output / "sizes" / f"default_{views}")
         row = {"views": views, "rung": result["rung"], "kB": chosen["size"] / 1000, "psnr": chosen["psnr"]}

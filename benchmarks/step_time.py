@@ -167,13 +167,8 @@ def measure_overhead(overrides: list[str]) -> dict[str, float]:
     Validation and snapshots are disabled; the overhead is the median over pairs of neighboring blocks, with quartiles.
     """
     steps = NUM_BLOCKS * BLOCK_STEPS + 1
-    settings = [
-        *overrides,
-        f"budget.steps={steps}",
-        "callbacks.validation.fractions=[]",
-        "callbacks.snapshots.steps=[]",
-    ]
-    cfg, data, system = build(settings)
+    disabled = "callbacks.validation.fractions=[]", "callbacks.snapshots.steps=[]"
+    cfg, data, system = build([*overrides, f"budget.steps={steps}", *disabled])
     plain_data = RayDataModule(data.scene, data.rays, data.samples, cfg.seed)  # the Trainer advances the other's state
     sync_resolution_scale(system, plain_data)
     with tempfile.TemporaryDirectory() as folder:
@@ -182,13 +177,8 @@ def measure_overhead(overrides: list[str]) -> dict[str, float]:
         trainer.fit(system, data)
     full, bare = alternation.trainer_blocks[FIRST_TIMED_BLOCK:], alternation.bare_blocks[FIRST_TIMED_BLOCK:]
     lower, middle, upper = quantiles([100 * (a / b - 1) for a, b in zip(full, bare, strict=True)])
-    return {
-        "bare_ms": 1e3 * median(bare),
-        "trainer_ms": 1e3 * median(full),
-        "overhead_percent": middle,
-        "lower_quartile": lower,
-        "upper_quartile": upper,
-    }
+    times = {"bare_ms": 1e3 * median(bare), "trainer_ms": 1e3 * median(full)}
+    return times | {"overhead_percent": middle, "lower_quartile": lower, "upper_quartile": upper}
 
 
 def measure(args: argparse.Namespace) -> Rows:

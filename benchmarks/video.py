@@ -35,14 +35,8 @@ FRAME_COUNTS = (20, 40)
 def measure(args: argparse.Namespace) -> Rows:
     """Measures a turn around the bulldozer with a pause, by number of selected frames; registers the largest number."""
     layout, seed, folder = SHEETS["six tags"], args.seeds[0], args.output
-    c2w = place_cameras(layout, LENS, TURN_FRAMES)
-    c2w = np.concatenate(
-        [
-            c2w[: TURN_FRAMES // 3],
-            np.repeat(c2w[TURN_FRAMES // 3 : TURN_FRAMES // 3 + 1], PAUSE_FRAMES, axis=0),
-            c2w[TURN_FRAMES // 3 :],
-        ]
-    )
+    before, after = np.split(place_cameras(layout, LENS, TURN_FRAMES), [TURN_FRAMES // 3])
+    c2w = np.concatenate([before, np.repeat(after[:1], PAUSE_FRAMES, axis=0), after])
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / "turn.mp4"
     write_video(file, blur_images(_render_frames(c2w, seed), seed))

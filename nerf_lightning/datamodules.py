@@ -32,7 +32,7 @@ from nerf_lightning.utils.option_checks import Count, Ge
 
 log = logging.getLogger(__name__)
 
-DOWNLOAD_TIMEOUT_SECONDS = 10.0
+TIMEOUT_SECONDS = 10.0
 
 
 def build_photo_data(
@@ -72,13 +72,8 @@ def build_photo_data(
             raise InputError("config", "dataset.path", "missing", hint="give the path of photos or a scene")
         path = fetch_published(url, Path(folder), download)
     if path is None:
-        return build_bricks_data(
-            resize if isinstance(resize, int) else 200,
-            rays=rays,
-            samples=samples,
-            seed=seed,
-            error_sampling=error_sampling,
-        )
+        size = resize if isinstance(resize, int) else 200
+        return build_bricks_data(size, rays=rays, samples=samples, seed=seed, error_sampling=error_sampling)
     kind = bounded if isinstance(bounded, str) else "true" if bounded else "false"
     options = PhotoLoadOptions(resize, holdout, masked, invert_masks, kind, orientation)
     return RayDataModule(open_scene(path, name, options, near, far), rays, samples, seed, error_sampling)
@@ -115,10 +110,7 @@ def build_bricks_data(
 
 def _download(url: str, target: Path) -> None:
     request = urllib.request.Request(url, headers={"User-Agent": "nerf_lightning"})
-    with (
-        urllib.request.urlopen(request, timeout=DOWNLOAD_TIMEOUT_SECONDS) as response,
-        atomic_write(target) as temporary,
-    ):
+    with urllib.request.urlopen(request, timeout=TIMEOUT_SECONDS) as response, atomic_write(target) as temporary:
         with temporary.open("wb") as file:
             shutil.copyfileobj(response, file)
         expected = response.headers.get("Content-Length")
@@ -138,9 +130,8 @@ def build_picture_data(
     """
     if path is None:
         # Procedural: available at any size.
-        picture = Picture(
-            "sunset", BUILT_IN, make_builtin_picture(max_side or 256), lambda width, _: make_builtin_picture(width)
-        )
+        image = make_builtin_picture(max_side or 256)
+        picture = Picture("sunset", BUILT_IN, image, lambda width, _: make_builtin_picture(width))
     else:
         source = expand_user_path(path)
         original = load_picture(source)

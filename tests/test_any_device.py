@@ -78,25 +78,18 @@ def train_steps(system: System, data: object, steps: int, where: torch.device) -
     return losses
 
 
+BARE_SCENE = [option for option in SCENE if not option.startswith("sampler.")]
+PENALTY = ["renderer.distortion_loss_weight=0.01", "renderer.background=white"]
 VARIANTS = {
     **{name: small_options(name) for name in SCENES},
-    **{
-        name: [*(one for one in SCENE if not one.startswith("sampler.")), "model=mlp", "model.width=16", *given]
-        for name, given in SAMPLERS.items()
-    },
-    "penalty, one color behind": [
-        *small_options("hashgrid"),
-        "renderer.distortion_loss_weight=0.01",
-        "renderer.background=white",
-    ],
+    **{name: [*BARE_SCENE, "model=mlp", "model.width=16", *given] for name, given in SAMPLERS.items()},
+    "penalty, one color behind": [*small_options("hashgrid"), *PENALTY],
     "random colors behind": [*small_options("tensorf"), "renderer.background=random"],
 }
 
 
 @pytest.mark.parametrize(("variant", "unbounded"), list(zip(VARIANTS, itertools.cycle([False, True]), strict=False)))
-def test_training_steps_on_device_match_cpu(
-    variant: str, unbounded: bool, device_without_float64: torch.device, tmp_path: Path
-):
+def test_training_steps_on_device_match_cpu(variant: str, unbounded: bool, device_without_float64, tmp_path: Path):
     set_kernels("reference")
     found = {}
     for where in (torch.device("cpu"), device_without_float64):
@@ -205,11 +198,8 @@ def test_train_on_device_finishes(name: str, device_without_float64: torch.devic
 def test_tools_run_of_cpu_work_on_device(device: torch.device, tmp_path: Path):
     """Evaluates, renders, exports and views a run."""
     run = tmp_path / "run"
-    train(
-        compose_config(
-            [*small_options("tensorf"), "device=cpu", "budget.steps=60", "~logger", "callbacks.orbit=null"], run
-        )
-    )
+    given = [*small_options("tensorf"), "device=cpu", "budget.steps=60", "~logger", "callbacks.orbit=null"]
+    train(compose_config(given, run))
     judged = evaluate(run, output=tmp_path / "evaluation", worst=1, device=NAME)
     expected = json.loads((run / "results.json").read_text())["psnr"]
     assert judged["device"].startswith(NAME)

@@ -15,7 +15,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.synthetic.objects import PILE, make_object_scene
 
 STEPS = 12
-FEW = ("callbacks.snapshots=null", "callbacks.orbit=null", "~logger")
+FEW = ("callbacks.snapshots=null", "callbacks.orbit=null", "sampler.resolution=16", "~logger")
 
 
 @pytest.fixture(scope="module")
@@ -31,15 +31,14 @@ def weights(run: nl.Run) -> list[torch.Tensor]:
 
 def test_train_from_python_matches_command_line(path: Path, run_cli, tmp_path: Path):
     scene = nl.load_scene(path)
-    run = nl.train(
-        scene, recipe="hashgrid_small", steps=STEPS, seed=3, device="cpu", folder=tmp_path / "mine", options=FEW
-    )
+    alike = {"recipe": "hashgrid_small", "steps": STEPS, "seed": 3, "device": "cpu", "options": FEW}
+    run = nl.train(scene, folder=tmp_path / "mine", **alike)
     given = ["dataset=photos", f"dataset.path='{path}'", "recipe=hashgrid_small", f"budget.steps={STEPS}", "seed=3"]
     code, _, err = run_cli(*given, "device=cpu", f"hydra.run.dir={tmp_path}/theirs", *FEW)
     assert code == 0, err
     theirs = nl.load_run(tmp_path / "theirs", device="cpu")
     assert all(map(torch.equal, weights(run), weights(theirs))) and run.psnr == theirs.psnr > 5
-    again = nl.train(path, "hashgrid_small", steps=STEPS, seed=3, device="cpu", folder=tmp_path / "again", options=FEW)
+    again = nl.train(path, folder=tmp_path / "again", **alike)
     assert all(map(torch.equal, weights(run), weights(again)))
 
     camera = scene.val.cameras[0]

@@ -17,29 +17,26 @@ ROOT = Path(__file__).resolve().parents[1]
 HELPER = ROOT / "tests" / "helpers" / "compile_models.py"
 
 
-def check_fields(cache: Path, *arguments: str) -> dict:
-    """Report of compile_models.py, run in a process of its own."""
-    paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(cache)}
-    line = [sys.executable, str(HELPER), *arguments]
+@pytest.mark.parametrize(
+    ("backend", "names"),
+    [
+        ("aot_eager", ["mlp", "voxels"]),  # with the compiled renderer, and growing
+        pytest.param("aot_eager", ["hashgrid", "tensorf"], marks=pytest.mark.long),
+        pytest.param(COMPILE_BACKEND, ["voxels"], marks=pytest.mark.long),
+    ],
+)
+def test_compiled_fields_and_training_match_plain_ones(backend: str, names: list[str], tmp_path: Path):
+    paths = {"PYTHONPATH": str(ROOT), "TORCHINDUCTOR_CACHE_DIR": str(tmp_path)}
+    line = [sys.executable, str(HELPER), backend, str(tmp_path), *names]
     done = subprocess.run(line, env={**os.environ, **paths}, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
+    assert list(found["fields"]) == names
     for name, field in found["fields"].items():
         assert field["worst"] < 1e-4 and field["compiled"] >= 2, name
         assert field["again"] == 0, f"{name}: a copy of it, or a batch of another size, was compiled anew"
-    return found
-
-
-def test_compiled_fields_and_training_match_plain_ones(tmp_path: Path):
-    """A field with the compiled renderer, a growing one, and a training."""
-    compiled, plain = check_fields(tmp_path, "aot_eager", "mlp", "voxels", "--train", str(tmp_path))["trained"]
+    compiled, plain = found["trained"]
     assert compiled == pytest.approx(plain, abs=0.05)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("backend", "names"), [("aot_eager", ["hashgrid", "tensorf"]), (COMPILE_BACKEND, ["voxels"])])
-def test_compiled_other_fields_and_kernels_match_plain_ones(backend: str, names: list[str], tmp_path: Path):
-    assert list(check_fields(tmp_path, backend, *names)["fields"]) == names
 
 
 def test_missing_compiler_is_one_line_and_writes_nothing(run_cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -30,6 +30,7 @@ SCENE = (
     "dataset.download=false dataset.resize=16 dataset.rays=64 callbacks.orbit.frames=2 budget.seconds=null budget.steps=2"
     " sampler.samples=32 sampler.resolution=16"
 )
+VIEWS = "dataset.size=16 dataset.train_views=4 dataset.val_views=1"
 PLAIN = " ".join(BARE)
 PICTURE = "dataset.max_side=16 dataset.pixels=64 budget.seconds=null budget.steps=2"
 SMALLER: list[tuple[str, str]] = [
@@ -44,7 +45,7 @@ SMALLER: list[tuple[str, str]] = [
     ("experiment=lego", SCENE),
     ("-m +experiment=picture", f"{PICTURE} {PLAIN}"),
     ("experiment=picture", PICTURE),
-    ("model=ball", "dataset.size=16 dataset.train_views=4 dataset.val_views=1 budget.steps=2 callbacks.orbit.frames=2"),
+    ("model=ball", f"{VIEWS} budget.steps=2 callbacks.orbit.frames=2 sampler.resolution=16"),
     ("capture --calibration", f"--tag-size {TAG_SIZE} --resize 60"),
     ("nerf_lightning render", "--frames 2"),
     ("export compact", "--max-psnr-drop 100"),
@@ -130,13 +131,7 @@ def smaller(line: str) -> str:
 @pytest.mark.parametrize(
     "page", [page for page in PAGES if "```bash" in page.read_text(encoding="utf-8")], ids=lambda page: page.stem
 )
-def test_docs_page_commands_succeed(
-    page: Path,
-    shell: Callable[[str], int],
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    request: pytest.FixtureRequest,
-):
+def test_docs_page_commands_succeed(page: Path, shell: Callable[[str], int], tmp_path: Path, capfd, request):
     tmp_path = place(tmp_path)
     (tmp_path / "ladder.yaml").write_text(
         "rungs: [{max_resolution: 8, base_resolution: 8}, {max_resolution: 12, base_resolution: 8}]\n"

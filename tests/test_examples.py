@@ -11,7 +11,6 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-from benchmarks.synthetic.photos import Truth
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.synthetic.objects import PILE, make_object_scene
 from tests.helpers.tag_views import TAG_SIZE
@@ -56,9 +55,7 @@ def test_example_own_part_learns(
         assert imageio.imread(tmp_path / "own_field.png").shape == (16, 32, 3)
 
 
-def test_example_own_photos_writes_orbit_and_field(
-    example: Callable[..., None], tag_capture: tuple[Path, Truth], tmp_path: Path
-):
+def test_example_own_photos_writes_orbit_and_field(example: Callable, tag_capture: tuple, tmp_path: Path):
     folder, _ = tag_capture
     given = [str(folder / "calibration"), str(folder / "photos"), "--tag", str(TAG_SIZE)]
     example("own_photos.py", *given, "--seconds", "0.5", "--pixels", "16")
@@ -69,9 +66,7 @@ def test_example_own_photos_writes_orbit_and_field(
 @pytest.mark.long
 def test_example_tour_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     notebook = nbformat.read(EXAMPLES / "tour.ipynb", as_version=4)
-    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells), (
-        "kept without outputs"
-    )
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in notebook.cells)
     monkeypatch.setenv("TOUR_SIZE", "16")
     monkeypatch.setenv("TOUR_STEPS", "5")
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")

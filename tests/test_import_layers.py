@@ -5,26 +5,12 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 ORDER = (
-    ("errors",),
-    ("utils",),
-    ("cameras",),
-    ("kernels",),
-    ("dataset", "model", "refine"),
-    ("synthetic",),
-    ("datamodules",),
-    ("sampler",),  # some have a small field of their own
-    ("renderer",),
-    ("system",),
-    ("drawing",),
-    ("callbacks",),
-    ("config",),
-    ("runs",),
+    *(("errors",), ("utils",), ("cameras",), ("kernels",)),
+    *(("dataset", "model", "refine"), ("synthetic",), ("datamodules",)),
+    *(("sampler",), ("renderer",), ("system",), ("drawing",), ("callbacks",)),  # some samplers have a small field
+    *(("config",), ("runs",)),
     ("capture", "check", "comparison", "evaluate", "export", "render", "view"),
-    ("training",),
-    ("stability", "sizing"),
-    ("cli",),
-    ("api", "__main__"),
-    ("__init__",),
+    *(("training",), ("stability", "sizing"), ("cli",), ("api", "__main__"), ("__init__",)),
 )
 """Each room may import from those above it."""
 UP = {("callbacks", "view")}

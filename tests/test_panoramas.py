@@ -67,12 +67,8 @@ def test_panoramas_room_trains_and_exports(scene: Scene, tmp_path: Path):
     mean = scene.train.pixels.float().mean(0)
     plain = -10 * math.log10(float(((scene.val.pixels.float() - mean) / 255).square().mean()))
     options = ["model=tensorf", "refine=both", "sampler.samples=48", "sampler.resolution=16", "~logger"]
-    options += [
-        "callbacks.snapshots=null",
-        "callbacks.orbit.frames=2",
-        "callbacks.validation.fractions=[]",
-        "dataset.samples=8192",
-    ]
+    options += ["callbacks.snapshots=null", "callbacks.orbit.frames=2", "callbacks.validation.fractions=[]"]
+    options += ["dataset.samples=8192"]
     run = nl.train(scene, steps=STEPS, device="cpu", folder=tmp_path / "run", options=options)
     assert run.psnr > plain + 6
     found, data = open_run(run.path, CPU), RayDataModule(scene)
@@ -103,10 +99,7 @@ def test_write_photos_panoramas_name_projection(scene: Scene, tmp_path: Path):
     assert frame["camera_model"] == "EQUIRECTANGULAR" and (frame["w"], frame["h"]) == (WIDTH, HEIGHT)
     assert [frame[key] for key in ("fl_x", "fl_y", "cx", "cy")] == [HEIGHT, HEIGHT, WIDTH / 2, HEIGHT / 2]
     again = load_transforms(tmp_path)
-    directions = [
-        one.train.cameras.generate_view_rays(1).directions
-        @ one.to_source[:3, :3].float().T
-        / torch.linalg.det(one.to_source[:3, :3]).float() ** (1 / 3)
-        for one in (again, scene)
-    ]
+    turns = [one.to_source[:3, :3] / torch.linalg.det(one.to_source[:3, :3]) ** (1 / 3) for one in (again, scene)]
+    rays = [one.train.cameras.generate_view_rays(1).directions for one in (again, scene)]
+    directions = [ray @ turn.float().T for ray, turn in zip(rays, turns, strict=True)]
     torch.testing.assert_close(*directions, atol=1e-5, rtol=0)

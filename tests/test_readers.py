@@ -163,13 +163,8 @@ def test_readers_pickled_payload_is_never_executed(whole: Path, tmp_path: Path):
     config["model"] = {"_target_": "os.system", "command": f"touch {canary}"}
     (run / "config.yaml").write_text(yaml.safe_dump(config))
     attempts: list[tuple[Reader, str]] = [
-        (read_npy, "a.npy"),
-        (load_compact, "a.npz"),
-        (read_scene, "a.npz"),
-        (read_checkpoint, "a.ckpt"),
-        (read_checkpoint, "a.pkl"),
-        (lambda path: read_yaml(path, "options"), "a.yaml"),
-        (load_run, "run"),
+        *((read_npy, "a.npy"), (load_compact, "a.npz"), (read_scene, "a.npz"), (read_checkpoint, "a.ckpt")),
+        *((read_checkpoint, "a.pkl"), (lambda path: read_yaml(path, "options"), "a.yaml"), (load_run, "run")),
     ]
     for read, name in attempts:
         with pytest.raises(InputError):

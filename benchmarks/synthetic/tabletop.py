@@ -43,9 +43,8 @@ class Tabletop:
         self.middle: Float[np.ndarray, "2"] = self.paper.mean(0)
         self.radius = float(np.linalg.norm(self.paper[1] - self.middle)) + TABLE_MARGIN_M
         side = patterns.markerSize + 2
-        self._modules = {
-            tag: cv2.aruco.generateImageMarker(patterns, tag, side) > 127 for tag in layout.poses if not hidden
-        }
+        tags = () if hidden else layout.poses
+        self._modules = {tag: cv2.aruco.generateImageMarker(patterns, tag, side) > 127 for tag in tags}
 
         low, high = load_bulldozer().aabb
         self.scale = OBJECT_LENGTH_M / (high[1] - low[1])
@@ -103,9 +102,8 @@ class Tabletop:
         """Mask of the points in the plane z = 0 that lie in the bulldozer's shadow."""
         out = np.zeros(len(points), bool)
         # The light is 56 degrees high: no shadow is longer than the bulldozer.
-        near = np.flatnonzero(
-            ((points > self.box[0, :2] - OBJECT_LENGTH_M) & (points < self.box[1, :2] + OBJECT_LENGTH_M)).all(-1)
-        )
+        low, high = self.box[0, :2] - OBJECT_LENGTH_M, self.box[1, :2] + OBJECT_LENGTH_M
+        near = np.flatnonzero(((points > low) & (points < high)).all(-1))
         local = (np.pad(points[near], ((0, 0), (0, 1))) - self.shift) / self.scale
         out[near] = ~find_unshadowed_points(render_shadow_map(), local)
         return out
@@ -183,9 +181,8 @@ def _find_nearest(solids, to_unit, origins, directions, solid, t):
             offset, half = subtract(origins[ray], solids.center[k]), solids.half_size[k]
             # Only if the ray intersects the bounding sphere.
             if dot(offset, offset) - dot(offset, d) ** 2 / dot(d, d) < 1.0001 * dot(half, half):
-                distance = entry_distance(
-                    solids.is_cylinder[k], transform(to_unit[k], offset), transform(to_unit[k], d)
-                )
+                matrix = to_unit[k]
+                distance = entry_distance(solids.is_cylinder[k], transform(matrix, offset), transform(matrix, d))
                 if distance < t[ray]:
                     solid[ray], t[ray] = k, distance
 

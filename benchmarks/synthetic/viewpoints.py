@@ -72,25 +72,20 @@ def make_object_cameras(
     # Between the object and the sheet; above the sheet's center if the object stands there.
     center = (top.box.mean(0) + sheet) / 2
     radius = float(np.linalg.norm(box - center, axis=-1).max())
-    start, out = rng.random(), []
+    start, out, min_tags = rng.random(), [], min(2, len(layout.poses))
     for i in range(count):
         near = 1.0
         for attempt in range(100):
             # From low elevations the object hides the tags behind it: try other heights and azimuths.
-            azimuth = (
-                2
-                * np.pi
-                * (start + (i + rng.uniform(-0.3, 0.3)) / (steps or count) + 0.002 * attempt * rng.uniform(-1, 1))
-            )
+            turns = start + (i + rng.uniform(-0.3, 0.3)) / (steps or count) + 0.002 * attempt * rng.uniform(-1, 1)
+            azimuth = 2 * np.pi * turns
             height = (start + i * GOLDEN_RATIO + (0.1 + 0.01 * attempt) * rng.uniform(-1, 1)) % 1
             elevation = np.radians(ELEVATION_RANGE_DEG[0] + (ELEVATION_RANGE_DEG[1] - ELEVATION_RANGE_DEG[0]) * height)
             distance = near * rng.uniform(1.0, 1.4) * radius * 2 * max(lens.fx, lens.fy) / min(lens.width, lens.height)
             c2w = _orbit_pose(center, distance * _direction(azimuth, elevation), np.radians(rng.normal(0, 6)))
             pixel = np.array([lens.cx, lens.cy]) + rng.uniform(-0.06, 0.06, 2) * (lens.width, lens.height)
             c2w = _aim_camera(lens, c2w, center, pixel)
-            if is_in_frame(lens, c2w, box).all() and len(find_visible_tags(top, lens, c2w)) >= min(
-                2, len(layout.poses)
-            ):
+            if is_in_frame(lens, c2w, box).all() and len(find_visible_tags(top, lens, c2w)) >= min_tags:
                 break
             near *= 1.02  # a larger distance shows more
         else:
@@ -119,9 +114,8 @@ def is_in_frame(
 def find_visible_tags(top: Tabletop, lens: Intrinsics, c2w: Float[np.ndarray, "4 4"]) -> list[int]:
     """Tags that a photo of the object fully shows: in the frame, not under the object, not behind it."""
     corners = {tag: top.layout.corners(tag) for tag in sorted(top.free_tags)}
-    return [
-        t for t, c in corners.items() if is_in_frame(lens, c2w, c).all() and not top.is_occluded(c2w[:3, 3], c).any()
-    ]
+    in_frame = {tag: points for tag, points in corners.items() if is_in_frame(lens, c2w, points).all()}
+    return [tag for tag, points in in_frame.items() if not top.is_occluded(c2w[:3, 3], points).any()]
 
 
 def _direction(azimuth: float, elevation: float) -> Float[np.ndarray, "3"]:

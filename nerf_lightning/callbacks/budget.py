@@ -43,10 +43,7 @@ class Budget(L.Callback):
     """
 
     def __init__(
-        self,
-        steps: Count | None = None,
-        seconds: PositiveFloat | None = None,
-        patience: PositiveFloat | None = None,
+        self, steps: Count | None = None, seconds: PositiveFloat | None = None, patience: PositiveFloat | None = None
     ):
         if steps is None and seconds is None:
             raise InputError("budget", "", "no limit on training", hint="give budget.steps=N or budget.seconds=S")
@@ -103,12 +100,9 @@ class Budget(L.Callback):
     @contextmanager
     def pause_to_render(self, trainer: L.Trainer, subject: str) -> Iterator[None]:
         """Pauses the clock to render. A signal may interrupt the block, so it must not change checkpointed state."""
-        is_single_process = trainer.world_size == 1  # several processes stop together, at the end of a step
-        with (
-            self.pause(),
-            self.render_timer.measure(subject),
-            defer_signals(False) if is_single_process else nullcontext(),
-        ):
+        # Several processes stop together, at the end of a step.
+        interruptible = defer_signals(False) if trainer.world_size == 1 else nullcontext()
+        with self.pause(), self.render_timer.measure(subject), interruptible:
             yield
 
     def sync_progress(self, trainer: L.Trainer) -> float:
@@ -151,13 +145,11 @@ class Budget(L.Callback):
             self._progress_line = (spent, growth.end, (1 - growth.end) / (1 - spent))
             plateau.reset_trend()
             return
-        remaining_gain_db = plateau.predict_gain(1 / spent) or 0.0
+        gain_db = plateau.predict_gain(1 / spent) or 0.0
         self._progress_line = (spent, self.state.progress, (1 - self.state.progress) / (COOLDOWN_FRACTION * spent))
-        self.final_plateau = {"seconds": round(self.seconds, 3), "step": step, "rest_db": round(remaining_gain_db, 3)}
-        print(
-            f"budget: plateau after {self.seconds:.1f} s: the rest would gain {remaining_gain_db:.2f} dB; cooling down",
-            flush=True,
-        )
+        self.final_plateau = {"seconds": round(self.seconds, 3), "step": step, "rest_db": round(gain_db, 3)}
+        text = f"budget: plateau after {self.seconds:.1f} s: the rest would gain {gain_db:.2f} dB; cooling down"
+        print(text, flush=True)
 
     def on_train_end(self, trainer: L.Trainer, pl_module: System) -> None:
         self.state.clock.stop()

@@ -186,12 +186,10 @@ class DivergenceRecovery(L.Callback):
     def _cap_learning_rate(self, trainer: L.Trainer, system: System) -> None:
         """Caps the learning rate at the field's known maximum, before the first step."""
         optimizer = trainer.optimizers[0]
-        requested_lr, max_lr = optimizer.param_groups[0]["initial_lr"], system.field.max_lr
-        if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and requested_lr > max_lr:
-            self.lr_factor = max_lr / requested_lr
-            cause = (
-                f"a learning rate of {requested_lr:.3g} is too high for this field, which trains at up to {max_lr:.3g}"
-            )
+        lr, max_lr = optimizer.param_groups[0]["initial_lr"], system.field.max_lr
+        if isinstance(optimizer, torch.optim.Adam | torch.optim.AdamW) and lr > max_lr:
+            self.lr_factor = max_lr / lr
+            cause = f"a learning rate of {lr:.3g} is too high for this field, which trains at up to {max_lr:.3g}"
             self._record(trainer, cause, f"{self.lr_factor:.2g} times the learning rate")
 
     def _restart(self, system: System, step: int, diverged: bool) -> str:

@@ -52,9 +52,8 @@ class Evaluation(RenderingCallback):
 
     def count_remaining_pixels(self, trainer: L.Trainer) -> float:
         data, test = get_datamodule(trainer), get_datamodule(trainer).scene.test
-        pixels = self._row_fraction * sum(
-            map(data.count_held_out_pixels, range(len(self.view_metrics), data.num_held_out_views))
-        )
+        remaining = range(len(self.view_metrics), data.num_held_out_views)
+        pixels = self._row_fraction * sum(map(data.count_held_out_pixels, remaining))
         if trainer.lightning_module.is_corrected and self.metrics["psnr_aligned"] is None:
             pixels += ALIGN_COST_PIXELS * data.num_held_out_views
         return pixels + (len(test.pixels) if test is not None and self.metrics["test"] is None else 0)
@@ -62,15 +61,13 @@ class Evaluation(RenderingCallback):
     def on_test_start(self, trainer: L.Trainer, pl_module: System) -> None:
         data = get_datamodule(trainer)
         pixels = sum(map(data.count_held_out_pixels, range(data.num_held_out_views)))
-        self._row_fraction = broadcast_from_rank_zero(
-            trainer, self.compute_affordable_fraction(trainer, pl_module, pixels)
-        )
+        fraction = self.compute_affordable_fraction(trainer, pl_module, pixels)
+        self._row_fraction = broadcast_from_rank_zero(trainer, fraction)
         data.set_test_subset(PixelSubset(row_fraction=self._row_fraction))
 
     def on_test_batch_start(self, trainer: L.Trainer, pl_module: System, batch: Any, batch_idx: int) -> None:
-        Budget.find(trainer).render_timer.start(
-            f"held-out view {batch_idx + 1} of {get_datamodule(trainer).num_held_out_views}"
-        )
+        count = get_datamodule(trainer).num_held_out_views
+        Budget.find(trainer).render_timer.start(f"held-out view {batch_idx + 1} of {count}")
 
     def on_test_batch_end(
         self, trainer: L.Trainer, pl_module: System, outputs: Any, batch: Any, batch_idx: int

@@ -17,7 +17,7 @@ from nerf_lightning.view.serve import announce, require_viser, resolve_host
 if TYPE_CHECKING:
     from nerf_lightning.view.field_page import FieldPage
 
-MAX_IMAGE_SIDE, MAX_IMAGE_SECONDS = 512, 0.06
+MAX_SIDE_PX, MAX_IMAGE_SECONDS = 512, 0.06
 """Longer side of an image in pixels, and its render seconds."""
 
 
@@ -62,9 +62,7 @@ class LiveViewer(L.Callback):
 
         from nerf_lightning.view.field_page import FieldPage
 
-        self.page = FieldPage(
-            scene.name, pl_module, scene.orbit, scene, self.host, self.port, MAX_IMAGE_SIDE, live=True
-        )
+        self.page = FieldPage(scene.name, pl_module, scene.orbit, scene, self.host, self.port, MAX_SIDE_PX, live=True)
         print(f"live: {announce(scene.name, self.host, self.port, self.page.port)}", flush=True)
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:

@@ -111,9 +111,8 @@ class LossMonitor:
         # A short spike, which falls again, does not matter.
         if min_loss < LEARNED_RATIO * self.constant_color_loss and has_risen and loss > STALL_RATIO * recent[0]:
             return f"the loss rose to {loss / min_loss:.0f} times its lowest"
-        if is_window_full and min(check_losses[1:]) > max(
-            WORSE_RATIO * min_loss, HALF_LEARNED_RATIO * self.constant_color_loss
-        ):
+        limit = max(WORSE_RATIO * min_loss, HALF_LEARNED_RATIO * self.constant_color_loss)
+        if is_window_full and min(check_losses[1:]) > limit:
             ratio = min_loss / self.constant_color_loss
             return f"the loss fell to {ratio:.2f} times that of a constant color, and has stayed above that since"
         return ""

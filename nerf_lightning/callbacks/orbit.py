@@ -54,10 +54,8 @@ class Orbit(RenderingCallback):
         scale = math.sqrt(self.compute_affordable_fraction(trainer, pl_module))
         cameras = full.rescale(scale).to(pl_module.device)
         if scale < 1:
-            size = f"{len(full)} frames of {cameras.width}x{cameras.height}"
-            print(
-                f"{ORBIT_FILE}: {size}, so that rendering takes no longer than training; nerf_lightning render takes any size"
-            )
+            frames = f"{ORBIT_FILE}: {len(full)} frames of {cameras.width}x{cameras.height}"
+            print(f"{frames}, so that rendering takes no longer than training; nerf_lightning render takes any size")
         with atomic_write(Path(trainer.default_root_dir) / ORBIT_FILE) as temporary:
             write_animation(temporary, self._render_frames(trainer, pl_module, cameras), 1 / self.fps)
 

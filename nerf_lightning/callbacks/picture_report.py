@@ -163,14 +163,12 @@ class PictureUpscaling(L.Callback):
         method = cv2.INTER_CUBIC if self.scale > 1 else cv2.INTER_AREA  # bicubic alone would skip pixels when shrinking
         bicubic = cv2.resize(scene.image.numpy(), (width, height), interpolation=method)
         images = {"bicubic": bicubic, "field": field} | ({} if truth is None else {"truth": truth.numpy()})
-        scores = {
-            name: None if truth is None else compute_psnr(images[name], images["truth"])
-            for name in ("field", "bicubic")
-        }
+        scores: dict[str, float | None] = {"field": None, "bicubic": None}
+        if truth is not None:
+            scores = {name: compute_psnr(images[name], images["truth"]) for name in scores}
         write_png(folder / "enlarged.png", field)
-        write_png(
-            folder / "enlarged_panel.png", make_panel([*images.values()], f"{' | '.join(images)}    {width}x{height}")
-        )
+        panel = make_panel([*images.values()], f"{' | '.join(images)}    {width}x{height}")
+        write_png(folder / "enlarged_panel.png", panel)
         size = {"scale": self.scale, "width": width, "height": height}
         write_json(folder / "enlarged.json", nan_to_none({**size, **scores}))
         text = ", ".join(f"{name} {format_psnr(psnr)}" for name, psnr in scores.items() if psnr is not None)

@@ -69,7 +69,5 @@ class RenderTimer:
 
     def add_timing(self, pixels: int, seconds: float) -> None:
         """Updates the seconds per pixel with a rendered view."""
-        each, weight = seconds / pixels, EMA_WEIGHT * min(1.0, pixels / PROBE_PIXELS)
-        self.seconds_per_pixel = (
-            each if self.seconds_per_pixel is None else (1 - weight) * self.seconds_per_pixel + weight * each
-        )
+        old, new, weight = self.seconds_per_pixel, seconds / pixels, EMA_WEIGHT * min(1.0, pixels / PROBE_PIXELS)
+        self.seconds_per_pixel = new if old is None else (1 - weight) * old + weight * new

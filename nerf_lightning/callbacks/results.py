@@ -2,7 +2,6 @@
 
 import math
 import platform
-from collections.abc import Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from statistics import fmean
@@ -34,12 +33,7 @@ GOOD_PSNR_DB = 30.0
 
 
 def summarize_run(
-    trainer: L.Trainer,
-    system: System,
-    method: str,
-    seed: int,
-    warnings: Sequence[str],
-    error: BaseException | None = None,
+    trainer: L.Trainer, system: System, method: str, seed: int, warnings: list[str], error: BaseException | None = None
 ) -> dict[str, Any]:
     """Content of results.json, with null for what was not measured.
 
@@ -79,7 +73,7 @@ def summarize_run(
         "rays_per_second": round(throughput.rays / budget.seconds, 1) if throughput and budget.seconds else None,
         **evaluation.metrics,
         "curve": collect_quality_curve(trainer),
-        "warnings": list(warnings),
+        "warnings": warnings,
         "plateau": budget.final_plateau,
         "corrections": summarize_corrections(corrections) if corrections and corrections.is_finite else None,
         "recoveries": [asdict(restart) for restart in recovery.recoveries] if recovery is not None else [],
@@ -104,14 +98,12 @@ def diagnose_run(trainer: L.Trainer, system: System, evaluation: Evaluation) -> 
     if not finite_views:
         return "collapsed", "no PSNR of held-out views: their renders are not finite, or no pixel is known"
     held_out_psnr = fmean(view["psnr"] for view in finite_views)
-    constant_color_psnr = fmean(view["constant_color_psnr"] for view in finite_views)
-    min_useful_psnr = min(constant_color_psnr + MIN_GAIN_DB, TRIVIAL_SCENE_DB)
+    constant_psnr = fmean(view["constant_color_psnr"] for view in finite_views)
+    min_useful_psnr = min(constant_psnr + MIN_GAIN_DB, TRIVIAL_SCENE_DB)
     view = get_datamodule(trainer).get_held_out_view(0).to(system.device)
     if held_out_psnr < min_useful_psnr:
-        diagnosis = (
-            f"held-out PSNR {held_out_psnr:.2f} dB is no better than a constant color ({constant_color_psnr:.2f} dB)"
-        )
-        return "collapsed", ": ".join(filter(None, (diagnosis, system.diagnose(view))))
+        cause = f"held-out PSNR {held_out_psnr:.2f} dB is no better than a constant color ({constant_psnr:.2f} dB)"
+        return "collapsed", ": ".join(filter(None, (cause, system.diagnose(view))))
     status = "stopped_early" if Budget.find(trainer).progress(trainer.global_step) < 1.0 else "finished"
     trained = [psnr for psnr in evaluation.photo_psnrs if math.isfinite(psnr)]
     if trained and held_out_psnr < min(fmean(trained) - OVERFIT_GAP_DB, GOOD_PSNR_DB):

@@ -15,7 +15,7 @@ from nerf_lightning.errors import InputError
 from nerf_lightning.system import System
 from nerf_lightning.utils.option_checks import Count
 
-MAX_LOGGED_WIDTH = 640
+MAX_LOG_WIDTH = 640
 """Most pixels across of an image for TensorBoard, which takes 0.1 s per megabyte."""
 SNAPSHOT_FOLDER, FINAL_FILE, TRUTH_FILE = "snapshots", "final.png", "truth.png"
 """Inside the run folder: all snapshots, the latest render, and its ground truth."""
@@ -84,9 +84,7 @@ class Snapshots(RenderingCallback):
             if not (folder / TRUTH_FILE).exists():
                 write_png(folder / TRUTH_FILE, to_uint8(result.truth))
             if isinstance(logger, L.pytorch.loggers.TensorBoardLogger):
-                logger.experiment.add_image(
-                    "images/view", limit_width(picture, MAX_LOGGED_WIDTH), step, dataformats="HWC"
-                )
+                logger.experiment.add_image("images/view", limit_width(picture, MAX_LOG_WIDTH), step, dataformats="HWC")
                 logger.experiment.flush()  # while paused: TensorBoard's thread would take time from training
 
     def on_train_batch_end(self, trainer: L.Trainer, pl_module: System, *batch: Any) -> None:

@@ -199,9 +199,8 @@ class Cameras(TensorDataclass):
             lens = self.lenses[view : view + 1]
             normalized = directions_to_normalized(local, lens.projection)
             # Beyond the valid radius a distortion polynomial may fold back into the photo.
-            is_visible = ((depth > 0) | (lens.projection != Projection.PERSPECTIVE)) & (
-                normalized.norm(dim=1) <= self.max_visible_radius[view]
-            )
+            is_undistortable = normalized.norm(dim=1) <= self.max_visible_radius[view]
+            is_visible = ((depth > 0) | (lens.projection != Projection.PERSPECTIVE)) & is_undistortable
             normalized = distort(normalized, lens.coefficients)[0]
         K, size = self.K[view], self.sizes[view].to(self.K)
         pixels = normalized @ K[:2, :2].T + K[:2, 2]

@@ -58,12 +58,10 @@ def capture_scene(
         InputError: invalid options or unusable photos.
     """
     sheet_paths, paths = find_photos(calibration, "calibration"), find_photos(photos, "photos")
-    dictionary_name = guess_dictionary(sheet_paths) if dictionary == "auto" else dictionary
-    known = None if layout is None or board else read_layout(layout, dictionary_name, tag_size).poses
-    detector = (
-        make_board_detector(dictionary_name, tag_size, board) if board else make_tag_detector(dictionary_name, tag_size)
-    )
-    log.info("detecting tags of %s in %s and %s", dictionary_name, calibration, photos)
+    dictionary = guess_dictionary(sheet_paths) if dictionary == "auto" else dictionary
+    known = None if layout is None or board else read_layout(layout, dictionary, tag_size).poses
+    detector = make_board_detector(dictionary, tag_size, board) if board else make_tag_detector(dictionary, tag_size)
+    log.info("detecting tags of %s in %s and %s", dictionary, calibration, photos)
     sheet, observations = detect_tags(sheet_paths, detector), detect_tags(paths, detector)
 
     lens_calibration = calibrate(calibration, sheet, known)
@@ -78,17 +76,13 @@ def capture_scene(
         if photo.c2w is None:
             log.warning("%s excluded: %s", photo.name, photo.reason)
     c2w = {photos / photo.name: photo.c2w for photo in registered if photo.c2w is not None}
-    scene = build_scene(
-        list(c2w), np.stack(list(c2w.values())), lens_calibration.lens, output.stem, str(photos), max_side, holdout
-    )
+    poses = np.stack(list(c2w.values()))
+    scene = build_scene(list(c2w), poses, lens_calibration.lens, output.stem, str(photos), max_side, holdout)
 
     save_npz(scene, output)
     _write_cameras(output.with_name("cameras.json"), registered, scene)
-    tags = {
-        "dictionary": dictionary_name,
-        "size": tag_size,
-        "to_world": {tag: p.tolist() for tag, p in solution.tags.items()},
-    }
+    to_world = {tag: pose.tolist() for tag, pose in solution.tags.items()}
+    tags = {"dictionary": dictionary, "size": tag_size, "to_world": to_world}
     _write_calibration(output.with_name("calibration.yaml"), lens_calibration, tags)
     return Capture(lens_calibration, solution, registered, scene)
 

@@ -58,10 +58,8 @@ def measure_photos(views: Views, split: str) -> list[PhotoQuality]:
         pixels = rgb[is_visible] if is_visible.any() else rgb.reshape(-1, 3)
         name = views.names[view] if views.names else f"{split} {view}"
         masks = pixels.max(1) >= SATURATED_LEVEL, pixels.max(1) <= BLACK_LEVEL
-        overexposed, underexposed = (float(np.mean(mask)) for mask in masks)
-        measured.append(
-            PhotoQuality(name, split, preview, sharpness(rgb), float(pixels.mean() / 255), overexposed, underexposed)
-        )
+        over, under = (float(np.mean(mask)) for mask in masks)
+        measured.append(PhotoQuality(name, split, preview, sharpness(rgb), float(pixels.mean() / 255), over, under))
     return measured
 
 

@@ -81,10 +81,7 @@ def describe_scene(scene: Scene) -> dict[str, str]:
 
 
 def render_check_page(
-    scene: Scene,
-    remarks: Sequence[str],
-    photos: Sequence[PhotoQuality],
-    poses: list[tuple[int, Float[np.ndarray, "4 4"]]],
+    scene: Scene, remarks: list[str], photos: Sequence[PhotoQuality], poses: list[tuple[int, Float[np.ndarray, "4 4"]]]
 ) -> str:
     """Renders the page's HTML, with the remarks first and photos by their number of issues."""
     worst_first = sorted(photos, key=lambda photo: (-len(photo.issues), photo.number))

@@ -109,7 +109,6 @@ def exit_with_error(error: Exception) -> NoReturn:
     """Prints an error in one line, after its traceback if `TRACEBACK_VARIABLE` is 1, and exits with 2."""
     if os.environ.get(TRACEBACK_VARIABLE) == "1":
         traceback.print_exception(error)
-    print(
-        f"nerf_lightning: {' '.join(str(error).split())} ({TRACEBACK_VARIABLE}=1 shows the traceback)", file=sys.stderr
-    )
+    message = " ".join(str(error).split())
+    print(f"nerf_lightning: {message} ({TRACEBACK_VARIABLE}=1 shows the traceback)", file=sys.stderr)
     sys.exit(2)

@@ -14,9 +14,7 @@ Box = Annotated[
     tuple[float, float, float, float, float, float] | None,
     Parameter(help="Crop to a box: X Y Z X Y Z of its lower, then upper corner, in the photos' unit."),
 ]
-Resolution = Annotated[
-    GridSize | None, Parameter(help="Cells along the longest side; default: the photos' resolution.")
-]
+Resolution = Annotated[GridSize | None, Parameter(help="Cells on the longest side; default: the photos' resolution.")]
 Threshold = Annotated[
     Annotated[float, Ge(0.001), Le(0.999)] | None,
     Parameter(help="Opacity of a cell at the surface; default: Otsu's method on the histogram."),
@@ -223,32 +221,25 @@ def _write_geometry(
         raise InputError("export", "box", " ".join(map(str, box)), "the lower, then the upper corner: X Y Z X Y Z")
     import torch
 
-    from nerf_lightning.export.mesh import (
-        SUFFIXES,
-        build_mesh_file,
-        build_points_file,
-        build_voxels_file,
-        select_training_views,
-    )
+    from nerf_lightning.export import mesh
     from nerf_lightning.export.volume import sample_volume
     from nerf_lightning.runs.open import open_scene_run
     from nerf_lightning.utils.device import resolve_device
     from nerf_lightning.utils.libraries import require_extra
 
     where, source = resolve_device(device), find_run(run)
-    target = _resolve_output(source, output, kind + SUFFIXES[kind][0], SUFFIXES[kind])
+    target = _resolve_output(source, output, kind + mesh.SUFFIXES[kind][0], mesh.SUFFIXES[kind])
     if kind != "voxels":
         require_extra("mesh", "skimage", "trimesh", purpose="the optional extra for meshes")
     loaded = open_scene_run(source, where)
-    volume = sample_volume(
-        loaded, resolution, None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
-    )
+    corners = None if box is None else torch.tensor(box, dtype=torch.float64).view(2, 3)
+    volume = sample_volume(loaded, resolution, corners)
     if kind == "voxels":
-        content, words = build_voxels_file(loaded, volume)
+        content, words = mesh.build_voxels_file(loaded, volume)
     elif kind == "points":
-        content, words = build_points_file(loaded, select_training_views(loaded, photos), volume, threshold)
+        content, words = mesh.build_points_file(loaded, mesh.select_training_views(loaded, photos), volume, threshold)
     else:
-        suffix = target.suffix.lower()
-        content, words = build_mesh_file(loaded, select_training_views(loaded, photos), volume, threshold, suffix)
+        cameras, suffix = mesh.select_training_views(loaded, photos), target.suffix.lower()
+        content, words = mesh.build_mesh_file(loaded, cameras, volume, threshold, suffix)
     size = f"{len(content) / 1e6:,.2f} MB"
     return _write(target, content, f"{size}, {words}, cells of {volume.cell * loaded.scale:.4g}")

@@ -52,12 +52,11 @@ def render(
     from nerf_lightning.utils.machine import describe_device
 
     began = time.perf_counter()
-    if output is not None:
-        check_output(check_output_path(output), background == "transparent")
+    target = None if output is None else check_output_path(output)
+    if target is not None:
+        check_output(target, background == "transparent")
     where, source = resolve_device(device), find_run(run)
-    target = (
-        get_output_folder(source) / f"render_{Path(path).stem}.webp" if output is None else check_output_path(output)
-    )
+    target = target or get_output_folder(source) / f"render_{Path(path).stem}.webp"
     loaded = open_scene_run(source, where)
     scene: Any = reload_data(loaded.cfg, loaded.scene, photos).scene if path in PHOTO_PATHS else None
     camera_path = build_path(path, frames, loaded.orbit, scene, loaded.to_source, path_frame, scale)

@@ -60,12 +60,8 @@ def draw_quality(points: pd.DataFrame) -> Figure:
         axes.plot(seeds, [row] * len(seeds), "|", color=color, markersize=12)
         axes.plot(point.psnr, row, marker, color=color, markersize=8, markeredgecolor="white")
         axes.annotate(f"{point.psnr:.2f}", (point.psnr_max, row), (8, -3), textcoords="offset points", fontsize=8)
-    axes.set_yticks(
-        range(len(shown)),
-        [shorten(replace_missing_glyphs(name), 34) for name in shown["label"]],
-        parse_math=False,
-        fontsize=8.5,
-    )
+    names = [shorten(replace_missing_glyphs(name), 34) for name in shown["label"]]
+    axes.set_yticks(range(len(shown)), names, parse_math=False, fontsize=8.5)
     for tick, collapsed in zip(axes.get_yticklabels(), shown["collapsed"], strict=True):
         tick.set_color(VERMILLION if collapsed else "black")
     axes.set(ylim=(len(shown) - 0.5, -0.7), xlabel="held-out PSNR, dB")
@@ -131,8 +127,6 @@ def scale_costs(axes: Axes, cost: str, values: list[float]) -> None:
 
 
 def add_label(axes: Axes, name: str, x: float, y: float, color: str) -> Text:
-    text = axes.text(
-        x, y, shorten(replace_missing_glyphs(name), 34), color=color, fontsize=8, zorder=6, parse_math=False
-    )
+    text = axes.text(x, y, shorten(replace_missing_glyphs(name), 34), color=color, size=8, zorder=6, parse_math=False)
     text.set_path_effects([withStroke(linewidth=2, foreground="white")])
     return text

@@ -21,9 +21,7 @@ IGNORED_NAMES = ("seed", "path", "folder", "url", "download", "accelerator")
 BACKGROUNDS = {"[0.0, 0.0, 0.0]": "black background", "[1.0, 1.0, 1.0]": "white background"}
 PUBLISHED_FILE = Path(__file__).with_name("published.yaml")
 """Published results, for comparison; never measured here."""
-REFERENCES_FORMAT = (
-    "publications as in published.yaml: source, hardware, conditions, scenes: {SCENE: {METHOD: [dB, seconds]}}"
-)
+YAML_FORMAT = "publications as in published.yaml: source, hardware, conditions, scenes: {SCENE: {METHOD: [dB, s]}}"
 
 
 class Conditions(NamedTuple):
@@ -115,10 +113,8 @@ def make_record(run: RunSummary) -> dict[str, Any]:
 
 def collect_options(run: RunSummary) -> dict[str, Any]:
     """Options that affect a run's result, by dotted key; its folder if they are unreadable."""
-    plain = {key: value for key, value in run.config.items() if key not in IGNORED_OPTIONS}
-    options = {
-        key: value for key, value in flatten_config(plain).items() if key.rsplit(".", 1)[-1] not in IGNORED_NAMES
-    }
+    flat = flatten_config({key: value for key, value in run.config.items() if key not in IGNORED_OPTIONS})
+    options = {key: value for key, value in flat.items() if key.rpartition(".")[2] not in IGNORED_NAMES}
     return options or {"folder": str(run.folder)}
 
 
@@ -164,7 +160,7 @@ def read_references(file: Path) -> pd.DataFrame:
     Raises:
         InputError: an unreadable file, or a missing or invalid value.
     """
-    publications, rows = read_yaml(file, REFERENCES_FORMAT), []
+    publications, rows = read_yaml(file, YAML_FORMAT), []
     try:
         for entry in publications.values():
             origin = f"{entry['conditions']}; {entry['hardware']}; {entry['source']}"
@@ -174,7 +170,5 @@ def read_references(file: Path) -> pd.DataFrame:
                         raise ValueError(f"{name}: {psnr} dB, {seconds} s")
                     rows.append((str(name), psnr, seconds, str(scene), origin))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            file, "", f"no references ({type(error).__name__}: {error})", hint=REFERENCES_FORMAT
-        ) from error
+        raise InputError(file, "", f"no references ({type(error).__name__}: {error})", hint=YAML_FORMAT) from error
     return pd.DataFrame(rows, columns=["name", "psnr", "seconds", "scene", "origin"])

@@ -61,11 +61,7 @@ class Comparison:
 
 
 def write_comparison(
-    runs: Sequence[RunSummary],
-    output: Path,
-    references: pd.DataFrame,
-    within_db: float = 0.5,
-    seconds: float = 15.0,
+    runs: Sequence[RunSummary], output: Path, references: pd.DataFrame, within_db: float = 0.5, seconds: float = 15.0
 ) -> pd.DataFrame:
     """Compares runs; writes compare.html, compare.png and compare.csv, and prints table and advice.
 
@@ -129,11 +125,8 @@ def draw_figure(comparisons: Sequence[Comparison], failures: Sequence[str]) -> U
     for comparison in comparisons[:MAX_COMPARISONS]:
         heading = "\n".join([comparison.title, comparison.details, *comparison.advice, *comparison.caveats])
         captions, images = [caption for caption, _ in comparison.images], [image for _, image in comparison.images]
-        parts.append(
-            make_contact_sheet(
-                comparison.panels, [""] * len(comparison.panels), 2, SHEET_WIDTH_PX, heading=heading, text_px=12
-            )
-        )
+        panels, blank = comparison.panels, [""] * len(comparison.panels)
+        parts.append(make_contact_sheet(panels, blank, 2, SHEET_WIDTH_PX, heading=heading, text_px=12))
         parts.append(make_contact_sheet(images, captions, 6, SHEET_WIDTH_PX, text_px=18))
     if failures:
         heading = "\n".join([f"Failed, collapsed or cut short ({len(failures)}):", *failures[:MAX_FAILURES]])
@@ -171,13 +164,7 @@ def print_comparisons(comparisons: Sequence[Comparison], failures: Sequence[str]
     for comparison in comparisons:
         cells = [[point.label, *fill_cells(point)] for point in comparison.points.itertuples()]
         table = pd.DataFrame(cells, columns=["", *HEADINGS]).to_string(index=False)
-        print(
-            f"{comparison.title}; {comparison.details}",
-            table,
-            CAPTION,
-            *comparison.advice,
-            *comparison.caveats,
-            sep="\n",
-        )
+        notes = *comparison.advice, *comparison.caveats
+        print(f"{comparison.title}; {comparison.details}", table, CAPTION, *notes, sep="\n")
     if failures:
         print("Failed, collapsed or cut short:", *failures, sep="\n")

@@ -37,7 +37,7 @@ from nerf_lightning.utils.option_checks import check_options
 LIGHTNING_DEVICES = ("cpu", "cuda", "mps")
 """Devices that Lightning supports; for any other it would silently take the CPU."""
 
-SUPPORTED_PRECISIONS = ("32-true", "16-mixed", "bf16-mixed", 32, "32", 16, "16", "bf16")
+PRECISIONS = ("32-true", "16-mixed", "bf16-mixed", 32, "32", 16, "16", "bf16")
 """Lightning precisions that training supports: kernels and volume rendering stay in float32."""
 
 
@@ -70,10 +70,8 @@ def instantiate_node(cfg: DictConfig, path: str, *kinds: type, **extra: Any) -> 
             raise  # our own targets raise InputError for bad options, so this is a defect
         raise InputError("config", path, f"{target.__name__} refuses its options: {error}") from error
     if kinds and not isinstance(result, kinds):
-        expected = " or ".join(kind.__name__ for kind in kinds)
-        raise InputError(
-            "config", f"{path}._target_", f"what makes a {type(result).__name__}", f"what makes a {expected}"
-        )
+        expected = f"what makes a {' or '.join(kind.__name__ for kind in kinds)}"
+        raise InputError("config", f"{path}._target_", f"what makes a {type(result).__name__}", expected)
     return result
 
 
@@ -132,9 +130,8 @@ def build_data(cfg: DictConfig, path: str | Path | None = None) -> DataModule:
     overrides = {}
     if cfg.dataset.get("resize") == AUTO:
         limits = build_budget(cfg)
-        overrides["resize"] = compute_auto_resize(
-            limits.max_seconds, limits.steps, resolve_run_device(cfg), torch.get_num_threads()
-        )
+        device, threads = resolve_run_device(cfg), torch.get_num_threads()
+        overrides["resize"] = compute_auto_resize(limits.max_seconds, limits.steps, device, threads)
     source = cfg if path is None else replace_photos(cfg, path)
     return instantiate_node(source, "dataset", RayDataModule, PixelDataModule, **overrides)
 
@@ -143,9 +140,8 @@ def replace_photos(cfg: DictConfig, path: str | Path) -> DictConfig:
     """Copies a configuration with the photos at `path`, in place of a built-in scene too."""
     new_cfg = copy.deepcopy(cfg)
     if "path" not in inspect.signature(resolve_target(cfg, "dataset")).parameters:
-        photo_options = {
-            key: value for key, value in cfg.dataset.items() if key in inspect.signature(build_photo_data).parameters
-        }
+        accepted = inspect.signature(build_photo_data).parameters
+        photo_options = {key: value for key, value in cfg.dataset.items() if key in accepted}
         new_cfg.dataset = {"_target_": "nerf_lightning.datamodules.build_photo_data", **photo_options}
     OmegaConf.update(new_cfg, "dataset.path", escape_interpolations(str(path)), force_add=True)
     return new_cfg
@@ -257,14 +253,10 @@ def build_trainer(cfg: DictConfig, folder: Path, device: torch.device) -> L.Trai
     # The budget comes first, as the others read its clock, and metrics come before images.
     callbacks = [build_budget(cfg), Evaluation(), *callbacks]
     precision = OmegaConf.select(cfg, "trainer.precision")
-    if precision not in (None, *SUPPORTED_PRECISIONS):
-        raise InputError(
-            "config", "trainer.precision", repr(precision), f"one of {', '.join(map(str, SUPPORTED_PRECISIONS))}"
-        )
+    if precision not in (None, *PRECISIONS):
+        raise InputError("config", "trainer.precision", repr(precision), f"one of {', '.join(map(str, PRECISIONS))}")
     # Checkpoints are written by callbacks/checkpoints.
-    options: dict[str, Any] = {"accelerator": device.type, "enable_checkpointing": False}
+    options: dict[str, Any] = {"accelerator": device.type, "enable_checkpointing": False, "default_root_dir": folder}
     if device.type not in LIGHTNING_DEVICES:
         options["strategy"] = SingleDeviceStrategy(device)
-    return instantiate_node(
-        cfg, "trainer", L.Trainer, callbacks=callbacks, logger=logger, default_root_dir=folder, **options
-    )
+    return instantiate_node(cfg, "trainer", L.Trainer, callbacks=callbacks, logger=logger, **options)

@@ -37,10 +37,8 @@ class ErrorSampler:
         self.views, self.fraction = views, fraction
         device = views.pixels.device
         sizes = views.cameras.sizes.to(device)
-        self.tiles_per_row = (sizes[:, 0] + TILE_SIZE - 1) // TILE_SIZE
-        self.tile_offsets = torch.cat(
-            [sizes.new_zeros(1), (self.tiles_per_row * ((sizes[:, 1] + TILE_SIZE - 1) // TILE_SIZE)).cumsum(0)]
-        )
+        self.tiles_per_row, tiles_per_column = ((sizes + TILE_SIZE - 1) // TILE_SIZE).unbind(1)
+        self.tile_offsets = torch.cat([sizes.new_zeros(1), (self.tiles_per_row * tiles_per_column).cumsum(0)])
         """Index of each photo's first tile, and the number of tiles."""
         tiles = int(self.tile_offsets[-1])
         _, _, widths, heights, _ = self._locate_tiles(torch.arange(tiles).to(device))

@@ -54,9 +54,7 @@ def is_invertible(intrinsics: Intrinsics) -> bool:
     lenses = Lenses(torch.tensor([intrinsics.distortion]).float(), torch.tensor([intrinsics.projection]))
     K = torch.from_numpy(intrinsics.K).float()[None]
     cameras = Cameras(K, torch.eye(4)[None], torch.tensor([[intrinsics.width, intrinsics.height]]), lenses)
-    across, down = (
-        torch.linspace(0, side - 1, ROUNDTRIP_GRID).long() for side in (intrinsics.width, intrinsics.height)
-    )
+    across, down = (torch.linspace(0, n - 1, ROUNDTRIP_GRID).long() for n in (intrinsics.width, intrinsics.height))
     row, col = torch.cartesian_prod(down, across).T
     directions = cameras.generate_rays(torch.zeros_like(row), row, col).directions
     pixels, _, _ = cameras.project(directions, 0)
@@ -68,12 +66,5 @@ def is_invertible(intrinsics: Intrinsics) -> bool:
 
 def make_equirectangular(width: int, height: int) -> Intrinsics:
     """Intrinsics of an equirectangular panorama, 360 x 180 degrees, centered on the optical axis."""
-    return Intrinsics(
-        width,
-        height,
-        fx=width / (2 * math.pi),
-        fy=height / math.pi,
-        cx=width / 2,
-        cy=height / 2,
-        projection=Projection.EQUIRECTANGULAR,
-    )
+    fx, fy, cx, cy = width / (2 * math.pi), height / math.pi, width / 2, height / 2
+    return Intrinsics(width, height, fx, fy, cx, cy, projection=Projection.EQUIRECTANGULAR)

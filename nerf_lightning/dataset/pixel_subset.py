@@ -30,9 +30,7 @@ class PixelSubset:
     def grid(self, width: int, height: int) -> tuple[Int[Tensor, "h"], Int[Tensor, "w"]]:
         """Row and column indices of the subset; at least one strip."""
         if self.stride > 1:
-            columns, rows = (
-                torch.arange(min(self.stride // 2, side - 1), side, self.stride) for side in (width, height)
-            )
+            columns, rows = (torch.arange(min(self.stride // 2, n - 1), n, self.stride) for n in (width, height))
             return rows, columns
         strips = max(1, round(self.row_fraction * height / STRIP_ROWS))
         if self.row_fraction >= 1 or strips * STRIP_ROWS >= height:

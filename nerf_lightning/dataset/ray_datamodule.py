@@ -178,9 +178,8 @@ class RayDataModule(StepDataModule[Views]):
         if self.error_sampling == 0:
             return make_batch(photos, photos.sample_pixels(self.rays, generator)[part], self._with_texture)
         if self._error_sampler is None or self._error_sampler.views is not photos:
-            self._sampler_state = (
-                self._sampler_state if self._error_sampler is None else self._error_sampler.state_dict()
-            )
+            if self._error_sampler is not None:
+                self._sampler_state = self._error_sampler.state_dict()
             self._error_sampler = ErrorSampler(photos, self.error_sampling)
             # The state is empty, or of other photos, if the numbers of tiles differ.
             if len(self._sampler_state.get("sums", ())) == len(self._error_sampler.sums):

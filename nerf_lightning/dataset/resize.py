@@ -59,9 +59,8 @@ def compute_auto_resize(seconds: float | None, steps: int | None, device: torch.
     limits = [] if seconds is None else [seconds * cores]
     limits += [] if steps is None else [steps * CORE_SECONDS_PER_STEP]
     work = min(limits, default=DEFAULT_TRAIN_SECONDS * cores)
-    return AutoResize(
-        round(max(REFERENCE_LONGEST_PX * (work / REFERENCE_CORE_SECONDS) ** SIZE_EXPONENT, MIN_LONGEST_PX))
-    )
+    longest = REFERENCE_LONGEST_PX * (work / REFERENCE_CORE_SECONDS) ** SIZE_EXPONENT
+    return AutoResize(round(max(longest, MIN_LONGEST_PX)))
 
 
 def choose_resize(

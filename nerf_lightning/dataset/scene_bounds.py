@@ -38,10 +38,7 @@ class VoxelProjection(NamedTuple):
 
 
 def estimate_bounds(
-    views: Views,
-    background: tuple[float, float, float],
-    near: float | None = None,
-    far: float | None = None,
+    views: Views, background: tuple[float, float, float], near: float | None = None, far: float | None = None
 ) -> Bounds:
     """Estimates a bounding box of the content, in world units.
 
@@ -53,9 +50,8 @@ def estimate_bounds(
     masks = extract_silhouettes(views, background) or []
     # The second pass has finer voxels, which tightens the box.
     for _ in range(2 if masks else 0):
-        hull = carve_visual_hull(
-            masks, project_voxels(aabb, HULL_RESOLUTION, views.cameras), min_views=0.5 * len(masks)
-        )
+        voxels = project_voxels(aabb, HULL_RESOLUTION, views.cameras)
+        hull = carve_visual_hull(masks, voxels, min_views=0.5 * len(masks))
         if hull.any():
             kept, voxel = list_voxel_centers(aabb, HULL_RESOLUTION)[hull], (aabb[1] - aabb[0]) / HULL_RESOLUTION
             aabb = np.stack([kept.min(0) - 1.5 * voxel, kept.max(0) + 1.5 * voxel])

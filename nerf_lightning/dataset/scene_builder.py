@@ -163,11 +163,8 @@ def assemble_scene(
 
     splits = [replace(apply_alpha(part, kind.is_cutout), cameras=move(part.cameras)) for part in parts]
     center = transform_points(from_source, region.center.double()).float()
-    orbit = (
-        make_orbit_path(splits[0].cameras, region.layout, center)
-        if hints.camera_path is None
-        else move(hints.camera_path)
-    )
+    path = hints.camera_path
+    orbit = make_orbit_path(splits[0].cameras, region.layout, center) if path is None else move(path)
     return Scene(
         name=name.lower(),
         source=str(source),
@@ -186,9 +183,8 @@ def assemble_scene(
 def locate_region(source: Path, views: Views, hints: Hints) -> Region:
     """Finds the region of interest of the training photos, see `find_region`."""
     points = None if hints.points is None else torch.from_numpy(hints.points)
-    region = find_region(
-        list_viewing_poses(views.cameras), points, lambda: triangulate_matches(views, views.cameras.c2w.numpy())
-    )
+    poses, c2w = list_viewing_poses(views.cameras), views.cameras.c2w.numpy()
+    region = find_region(poses, points, lambda: triangulate_matches(views, c2w))
     if not checks.MIN_CAMERA_DISTANCE <= region.unit <= checks.MAX_COORDINATE:
         expected = f"a distance of {checks.MIN_CAMERA_DISTANCE:g} to {checks.MAX_COORDINATE:g}"
         found = f"cameras {region.unit:.3g} from their subject"

@@ -1,6 +1,7 @@
 """Plausibility checks of a scene before training: poses, background, silhouettes, duplicates, bounds."""
 
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import torch
@@ -9,16 +10,10 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, CameraLayout
 from nerf_lightning.cameras.camera_layout import find_convergence
+from nerf_lightning.dataset import scene_bounds
 from nerf_lightning.dataset.matching.pose_checks import SceneIssue, compare_with_matches
 from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.scene import Scene
-from nerf_lightning.dataset.scene_bounds import (
-    MAX_HULL_VIEWS,
-    estimate_visible_cube,
-    extract_silhouettes,
-    find_border_color,
-    measure_hull_coverage,
-)
 from nerf_lightning.errors import InputError
 
 POSITION_TOLERANCE, ROTATION_TOLERANCE = 1e-6, 1e-6
@@ -73,10 +68,8 @@ def check_content(scene: Scene) -> Iterator[SceneIssue]:
     if len(views) == 1:
         yield SceneIssue("one photo to train on", is_fatal=True, hint=hint)
     elif len(views.cameras.sizes.unique(dim=0)) == 1:
-        images = views.images
-        if all(
-            float((image.float() - images[0].float()).abs().mean()) < MAX_DUPLICATE_DIFFERENCE for image in images[1:]
-        ):
+        first, *others = views.images
+        if all(float((image.float() - first.float()).abs().mean()) < MAX_DUPLICATE_DIFFERENCE for image in others):
             yield SceneIssue("identical training photos", is_fatal=True, hint=hint)
 
 
@@ -93,7 +86,7 @@ def check_cameras(scene: Scene) -> Iterator[SceneIssue]:
 
 def check_background(scene: Scene) -> Iterator[SceneIssue]:
     """Checks for a uniform border color that differs from the stated background."""
-    if scene.bounds.unbounded or (border := find_border_color(scene.train)) is None:
+    if scene.bounds.unbounded or (border := scene_bounds.find_border_color(scene.train)) is None:
         return
     if max(abs(a - b) for a, b in zip(border, scene.background, strict=True)) > BACKGROUND_TOLERANCE:
         actual, stated = ([round(channel, 2) for channel in color] for color in (border, scene.background))
@@ -102,19 +95,17 @@ def check_background(scene: Scene) -> Iterator[SceneIssue]:
 
 def check_silhouettes(scene: Scene) -> Iterator[SceneIssue]:
     """Checks silhouettes for consistency, which detects shuffled or rotated poses (not of a ball)."""
-    views = scene.train.subsample(MAX_HULL_VIEWS)
-    masks = extract_silhouettes(views, scene.background)
+    views = scene.train.subsample(scene_bounds.MAX_HULL_VIEWS)
+    masks = scene_bounds.extract_silhouettes(views, scene.background)
     if masks is None or len(views) < 3 or scene.bounds.unbounded:
         return
+    measure_coverage = partial(scene_bounds.measure_hull_coverage, masks, views.cameras)
     area = np.mean([mask.mean() for mask in masks])
-    if (
-        not 0 < area <= MAX_CONTENT_FRACTION
-        or (coverage := measure_hull_coverage(masks, views.cameras, scene.bounds)) >= GOOD_COVERAGE
-    ):
+    if not 0 < area <= MAX_CONTENT_FRACTION or (coverage := measure_coverage(scene.bounds)) >= GOOD_COVERAGE:
         return
-    visible_cube = Bounds(torch.from_numpy(estimate_visible_cube(views.cameras)).float())
+    visible_cube = Bounds(torch.from_numpy(scene_bounds.estimate_visible_cube(views.cameras)).float())
     is_fatal = coverage < MIN_COVERAGE
-    if coverage < MIN_BOX_COVERAGE and measure_hull_coverage(masks, views.cameras, visible_cube) >= GOOD_COVERAGE:
+    if coverage < MIN_BOX_COVERAGE and measure_coverage(visible_cube) >= GOOD_COVERAGE:
         yield SceneIssue(f"content outside the box, which covers {coverage:.0%} of the silhouettes", is_fatal=is_fatal)
     else:
         text = (

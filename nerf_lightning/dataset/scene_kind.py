@@ -64,10 +64,8 @@ def has_cutout_alpha(views: Views) -> bool:
     cutouts = []
     for view in range(len(subset := views.subsample(MAX_HULL_VIEWS))):
         hidden = subset.image(view)[..., 3].numpy() <= MAX_HIDDEN_ALPHA
-        cutouts.append(
-            hidden.mean() >= MIN_TRANSPARENT_FRACTION
-            and extract_border(hidden).mean() >= MIN_TRANSPARENT_BORDER_FRACTION
-        )
+        has_clear_border = extract_border(hidden).mean() >= MIN_TRANSPARENT_BORDER_FRACTION
+        cutouts.append(has_clear_border and hidden.mean() >= MIN_TRANSPARENT_FRACTION)
     return bool(np.mean(cutouts) >= MIN_CUTOUT_FRACTION)
 
 

@@ -46,9 +46,7 @@ class Views(TensorDataclass):
     @cached_property
     def offsets(self) -> Int[Tensor, "V1"]:
         """Start of each photo in `pixels`, and the end of the last."""
-        return torch.cat([torch.zeros(1, dtype=torch.long), self.cameras.sizes.prod(1).cumsum(0)]).to(
-            self.pixels.device
-        )
+        return torch.cat([torch.tensor([0]), self.cameras.sizes.prod(1).cumsum(0)]).to(self.pixels.device)
 
     @cached_property
     def widths(self) -> Int[Tensor, "V"]:

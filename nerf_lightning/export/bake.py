@@ -106,13 +106,8 @@ def bake_voxels(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
     across = cells or min(max(math.ceil(min(bounds.unit_cube_pixels, MAX_RESOLUTION)), MIN_RESOLUTION), MAX_RESOLUTION)
     seen = dilate(find_visible_cells(system, cameras, across))
     while True:
-        options: dict[str, Any] = {
-            "base_resolution": across,
-            "max_resolution": across,
-            "stages": 1,
-            "degree": SH_DEGREE,
-            "size": "fixed",
-        }
+        options: dict[str, Any] = {"base_resolution": across, "max_resolution": across, "stages": 1}
+        options |= {"degree": SH_DEGREE, "size": "fixed"}
         voxels = VoxelField(bounds, **options).to(system.device)
         vertices = vertices_of_cells(seen, across)
         positions = bounds.to_world((vertices.nonzero() / across).clamp(CUBE_MARGIN, 1 - CUBE_MARGIN))
@@ -129,11 +124,8 @@ def bake_voxels(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
     parts = [fit_colors(system, part, centers, voxels.terms) for part in positions[chosen].split(CHUNK_VERTICES)]
     colors, views = (torch.cat(column) for column in zip(*parts, strict=True))
     raw = (density[chosen] * voxels.unit_length).log().clamp(EMPTY_LOG_DENSITY, 15.0) / voxels.density_lr_scale
-    empty_row = (
-        raw.new_full((1,), EMPTY_LOG_DENSITY / voxels.density_lr_scale),
-        colors.new_zeros(1, 3),
-        views.new_zeros(1, views.shape[1]),
-    )
+    empty = raw.new_full((1,), EMPTY_LOG_DENSITY / voxels.density_lr_scale)
+    empty_row = empty, colors.new_zeros(1, 3), views.new_zeros(1, views.shape[1])
     voxels.set_vertices(keep.flatten(), [torch.cat(pair) for pair in zip(empty_row, (raw, colors, views), strict=True)])
     return voxels, options
 
@@ -145,9 +137,8 @@ def distill(baked: NeRF3D, system: NeRF3D, cameras: Cameras) -> None:
         rays.append(cameras.generate_view_rays(view))
         with torch.no_grad():
             colors.append(system.render(rays[-1].to(system.device)).rgb.cpu())
-    origins, directions, targets = (
-        torch.cat(x) for x in ([r.origins for r in rays], [r.directions for r in rays], colors)
-    )
+    origins, directions = torch.cat([r.origins for r in rays]), torch.cat([r.directions for r in rays])
+    targets = torch.cat(colors)
     generator = torch.Generator(system.device).manual_seed(system.seed)
     optimizer = torch.optim.Adam(baked.field.parameters(), DISTILL_LR, (0.5, 0.99))
     for step in track_progress(range(DISTILL_STEPS), DISTILL_STEPS, "steps"):

@@ -110,11 +110,7 @@ def subsample_cameras(data: DataModule, max_views: int = MAX_VISIBILITY_VIEWS) -
 
 
 def compress_system(
-    system: Any,
-    data: DataModule,
-    config: dict[str, Any],
-    max_psnr_drop: float,
-    seen: CellMask | None = None,
+    system: Any, data: DataModule, config: dict[str, Any], max_psnr_drop: float, seen: CellMask | None = None
 ) -> CompactFile:
     """Encodes a system in the fewest bytes within `max_psnr_drop`: first only visible cells, then all.
 
@@ -144,7 +140,5 @@ def compress_system(
             if attempts[-1].psnr_drop <= max_psnr_drop:
                 return attempts[-1]
     best = min(attempts, key=lambda compact: compact.psnr_drop)
-    advice = f"allow it with --max-psnr-drop {best.psnr_drop + 0.005:.2f}"
-    raise InputError(
-        "export", "max_psnr_drop", f"{best.psnr_drop:.2f} dB lost", f"at most {max_psnr_drop:g} dB", advice
-    )
+    hint = f"allow it with --max-psnr-drop {best.psnr_drop + 0.005:.2f}"
+    raise InputError("export", "max_psnr_drop", f"{best.psnr_drop:.2f} dB lost", f"at most {max_psnr_drop:g} dB", hint)

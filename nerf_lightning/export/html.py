@@ -27,11 +27,7 @@ MAX_PHOTOS = 100
 
 
 def build_page(
-    source: Path,
-    device: torch.device,
-    cells: int | None = None,
-    max_psnr_drop: float = 0.1,
-    photos: Path | None = None,
+    source: Path, device: torch.device, cells: int | None = None, max_psnr_drop: float = 0.1, photos: Path | None = None
 ) -> tuple[str, str]:
     """Builds a run's web page; returns it with a summary. Options as in `cli.export.export_html`."""
     run = open_run(source, device)
@@ -52,10 +48,8 @@ def build_page(
     compact = compress_system(baked.system, data, baked.config, max_psnr_drop, seen)
     original_psnr = measure_held_out_psnr(system, data) if baked.changes else compact.psnr_before
     content, changes = strip_local_paths(compact.content), "; ".join(baked.changes)
-    measured = [
-        ("held-out PSNR", f"{compact.psnr:.2f} dB"),
-        ("size", f"{len(content) / 1000:,.1f} kB, {compact.precision} precision"),
-    ]
+    size = f"{len(content) / 1000:,.1f} kB, {compact.precision} precision"
+    measured = [("held-out PSNR", f"{compact.psnr:.2f} dB"), ("size", size)]
     if changes:
         measured.append(("drawn with", f"{changes}: {original_psnr - compact.psnr:.2f} dB lost"))
     train, indices = data.scene.train, subsample(len(data.scene.train), MAX_PHOTOS)

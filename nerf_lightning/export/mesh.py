@@ -116,20 +116,13 @@ def build_voxels_file(run: LoadedSceneRun, volume: Volume) -> ExportedFile:
     """
     solid = volume.density > 0
     index = solid.nonzero()
-    gradient = torch.stack(
-        torch.gradient(volume.opacity) if min(solid.shape) > 1 else [torch.zeros(solid.shape)] * 3, -1
-    )
-    outwards = -torch.nn.functional.normalize(gradient[solid], dim=-1)
+    parts = torch.gradient(volume.opacity) if min(solid.shape) > 1 else [torch.zeros(solid.shape)] * 3
+    outwards = -torch.nn.functional.normalize(torch.stack(parts, -1)[solid], dim=-1)
     outwards[outwards.norm(dim=1) < 0.5] = torch.tensor([0.0, 0.0, 1.0])  # arbitrary where density is constant
     rgb = np.zeros((*solid.shape, 3), np.uint8)
     rgb[solid.numpy()] = query_colors(run.system, volume.index_to_world(index.float()), outwards)
-    file = io.BytesIO()
-    arrays: dict[str, Any] = {
-        "density": (volume.density / run.scale).numpy().astype(np.float32),
-        "rgb": rgb,
-        "to_source": (run.to_source @ volume.to_world).numpy(),
-    }
-    np.savez_compressed(file, **arrays)
+    file, density = io.BytesIO(), (volume.density / run.scale).numpy().astype(np.float32)
+    np.savez_compressed(file, density=density, rgb=rgb, to_source=(run.to_source @ volume.to_world).numpy())
     shape = " x ".join(map(str, solid.shape))
     return ExportedFile(file.getvalue(), f"{shape} cells, {len(index):,} of them not empty")
 
@@ -189,5 +182,4 @@ def encode_mesh(mesh: "trimesh.Trimesh", suffix: str, rotation: Float[ndarray, "
     scene, node = trimesh.Scene(), np.eye(4)
     node[:3, :3], node[:3, 3] = Y_UP @ rotation, Y_UP @ center
     scene.add_geometry(centered, transform=node)
-    content = scene.export(file_type="glb")
-    return content
+    return scene.export(file_type="glb")

@@ -72,13 +72,10 @@ def find_region(bounds: Bounds, box: Float[Tensor, "2 3"], to_source: Float[Tens
     aabb = bounds.aabb.cpu()
     region = torch.stack([torch.maximum(corners.amin(0), aabb[0]), torch.minimum(corners.amax(0), aabb[1])])
     if not (region[0] < region[1]).all():
-        source_corners = transform_points(to_source, torch.cartesian_prod(*aabb.double().T))
-        low, high = (
-            [round(x, 4) for x in corner.tolist()] for corner in (source_corners.amin(0), source_corners.amax(0))
-        )
-        raise InputError(
-            "export", "box", str(box.flatten().tolist()), f"something within {low} to {high}, the scene's box"
-        )
+        limits = transform_points(to_source, torch.cartesian_prod(*aabb.double().T)).aminmax(dim=0)
+        low, high = ([round(x, 4) for x in corner.tolist()] for corner in limits)
+        expected = f"something within {low} to {high}, the scene's box"
+        raise InputError("export", "box", str(box.flatten().tolist()), expected)
     return region
 
 
@@ -98,11 +95,9 @@ def sample_volume(
     """
     system, bounds = run.system, run.system.field.bounds
     region = bounds.aabb.cpu() if box is None else find_region(bounds, box, run.to_source)
-    sides = region[1] - region[0]
+    sides, footprint = region[1] - region[0], bounds.pixel_footprint
     if resolution is None:
-        across = (
-            float(sides.max()) / (CELL_WIDTH_PIXELS * bounds.pixel_footprint) if bounds.pixel_footprint else math.inf
-        )
+        across = float(sides.max()) / (CELL_WIDTH_PIXELS * footprint) if footprint else math.inf
         resolution = round(min(max(across, MIN_RESOLUTION), MAX_RESOLUTION))
     cell = float(sides.max()) / resolution
     shape = [max(1, math.ceil(float(side) / cell - 1e-6)) for side in sides]

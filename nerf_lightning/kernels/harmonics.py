@@ -47,11 +47,8 @@ def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, l
     constants = [CONSTANTS.get(function, 0.0) for function in range(len(TERMS))]
     firsts, seconds, pairs, axes = (list(column) for both in (PAIRS, TRIPLES) for column in zip(*both, strict=True))
     columns = [torch.tensor(column, device=device) for column in (firsts + seconds + axes, pairs)]
-    return (
-        torch.tensor(factors, dtype=dtype, device=device),
-        torch.tensor(constants, dtype=dtype, device=device),
-        columns,
-    )
+    matrix, bias = (torch.tensor(values, dtype=dtype, device=device) for values in (factors, constants))
+    return matrix, bias, columns
 
 
 def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:

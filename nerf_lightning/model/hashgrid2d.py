@@ -51,17 +51,12 @@ class HashGrid2DField(PictureField):
         pixels, max_resolution = max(cells), min(max(cells), max_resolution or max(cells))
         first = max_resolution if num_levels == 1 else min(base_resolution, max_resolution)
         num_levels = num_levels or 1 + round(math.log(max_resolution / first) / math.log(PER_LEVEL_SCALE))
-        level_cells = [
-            [max(1, round(c * r / pixels)) for c in cells] for r in level_resolutions(num_levels, first, max_resolution)
-        ]
-        resolutions = list(
-            dict.fromkeys((across, down) for across, down in level_cells)
-        )  # small pictures repeat a level
+        levels = level_resolutions(num_levels, first, max_resolution)
+        across, down = ([max(1, round(c * r / pixels)) for r in levels] for c in cells)
+        resolutions = list(dict.fromkeys(zip(across, down, strict=True)))  # small pictures repeat a level
         if log2_hashmap_size is None:
-            numbers = parameter_ratio * 3 * size[0] * size[1]
-            log2_sizes = [
-                e for e in range(4, 25) if sum(table_sizes(resolutions, 2**e)) * features_per_level <= numbers
-            ]
+            limit = parameter_ratio * 3 * size[0] * size[1]
+            log2_sizes = [e for e in range(4, 25) if sum(table_sizes(resolutions, 2**e)) * features_per_level <= limit]
             log2_hashmap_size = max(log2_sizes, default=4)
         self.grid = HashGrid(resolutions, log2_hashmap_size, features_per_level)
         self.net = build_layers(self.grid.width, width, 3)

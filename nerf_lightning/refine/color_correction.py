@@ -109,15 +109,13 @@ class ColorCorrection(torch.nn.Module):
             return rgb
         background = (1 - opacity)[:, None] * backgrounds
         foreground = rgb - background
-        corrected_foreground = foreground * self.gains.index_select(0, views)
+        corrected = foreground * self.gains.index_select(0, views)
         if self.color_matrices is not None:
             matrix, shift = self._subtract_mean(self.color_matrices).index_select(0, views).split((3, 1), dim=2)
-            corrected_foreground = (
-                corrected_foreground + (matrix * foreground[:, None]).sum(2) + shift[..., 0] * opacity[:, None]
-            )
+            corrected = corrected + (matrix * foreground[:, None]).sum(2) + shift[..., 0] * opacity[:, None]
         if self.vignetting_coefficients is not None:
-            corrected_foreground = corrected_foreground * self.compute_vignetting(rays.directions, views)
-        corrected = corrected_foreground + background
+            corrected = corrected * self.compute_vignetting(rays.directions, views)
+        corrected = corrected + background
         return corrected if truth is None else torch.where(truth >= 1, corrected.clamp_max(1), corrected)
 
     def compute_vignetting(self, directions: Float[Tensor, "R 3"], views: Int[Tensor, "R"]) -> Float[Tensor, "R 1"]:

@@ -63,9 +63,8 @@ class Corrections(torch.nn.Module):
         self.learning_rates = {"poses": pose_lr} if poses else {}
         self.learning_rates |= {"exposure": exposure_lr} if exposure else {}
         if not self.learning_rates:
-            raise InputError(
-                "refine.poses", "", "false, with refine.exposure=false", "one of them", "or give refine=null"
-            )
+            found, hint = "false, with refine.exposure=false", "or give refine=null"
+            raise InputError("refine.poses", "", found, "one of them", hint)
         for part, is_enabled in {"focal": focal, "affine": affine, "vignetting": vignetting}.items():
             if is_enabled and (required := REQUIRED_CORRECTION[part]) not in self.learning_rates:
                 found, hint = f"true, with refine.{required}=false", f"or give refine.{required}=true"

@@ -47,9 +47,7 @@ def parse_style(system: NeRF3D, path: CameraPath, channels: str, background: str
         if background == "transparent":
             raise InputError("render", "background", background, "a color, for a path along photos")
         if path.photos.channels == 3 and not np.allclose((red, green, blue), scene_color, atol=1e-3):
-            expected = (
-                f"scene: these photos have no alpha, and their background is {[round(part, 3) for part in scene_color]}"
-            )
+            expected = f"scene: these photos have no alpha, but a background of {[round(c, 3) for c in scene_color]}"
             raise InputError("render", "background", background, expected)
     depths = measure_depth_range(system, path.cameras) if "depth" in names else (0.0, 1.0)
     return FrameStyle(names, None if background == "transparent" else (red, green, blue), depths)

@@ -98,9 +98,8 @@ class VolumeRenderer(torch.nn.Module):
         self.background = Background(background, scene_background, alpha)
         self.distortion_loss_weight = distortion_loss_weight
         self.near_loss_weight = near_loss_weight
-        self.view_loss_weight = (
-            AUTO_VIEW_LOSS_WEIGHT[unbounded] if isinstance(view_loss_weight, str) else view_loss_weight
-        )
+        auto_weight = AUTO_VIEW_LOSS_WEIGHT[unbounded]
+        self.view_loss_weight = auto_weight if isinstance(view_loss_weight, str) else view_loss_weight
         self.half_size = half_size
         self.unbounded = unbounded
 
@@ -131,11 +130,7 @@ class VolumeRenderer(torch.nn.Module):
         return RenderOutput(color, opacity, distance, weights, view_residual)
 
     def losses(
-        self,
-        output: RenderOutput,
-        samples: Samples,
-        progress: float,
-        texturelessness: Float[Tensor, "R"] | None = None,
+        self, output: RenderOutput, samples: Samples, progress: float, texturelessness: Float[Tensor, "R"] | None = None
     ) -> dict[str, Float[Tensor, ""]]:
         """Weighted regularization losses by name.
 

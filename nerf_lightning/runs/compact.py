@@ -107,9 +107,8 @@ def decode_run(content: bytes, path: Path | str, device: torch.device = CPU) -> 
         cfg = parse_config(header["config"], path)
         with attribute_errors_to(path):
             system = build_system(cfg, frame, device)
-        tensors = {
-            key: _dequantize(key, arrays, entry["code"], entry["shape"]) for key, entry in header["arrays"].items()
-        }
+        codes = header["arrays"].items()
+        tensors = {key: _dequantize(key, arrays, entry["code"], entry["shape"]) for key, entry in codes}
         for part, module in system.exportable_modules.items():
             prefix = f"{part}."
             module.import_state({key[len(prefix) :]: value for key, value in tensors.items() if key.startswith(prefix)})

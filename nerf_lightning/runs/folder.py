@@ -102,13 +102,8 @@ def check_config(path: Path | str, key: str, node: Any) -> None:
         for name, value in node.items():
             if name == "_target_" and not _is_trusted(value):
                 expected = "a class of this package that configurations name"
-                raise InputError(
-                    path,
-                    f"{key}._target_",
-                    repr(value),
-                    expected,
-                    f"set {TRUSTED_PACKAGES_VARIABLE} to allow its package",
-                )
+                hint = f"set {TRUSTED_PACKAGES_VARIABLE} to allow its package"
+                raise InputError(path, f"{key}._target_", repr(value), expected, hint)
             check_config(path, f"{key}.{name}" if key else str(name), value)
     elif isinstance(node, list):
         for index, value in enumerate(node):

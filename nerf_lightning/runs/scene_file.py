@@ -83,10 +83,8 @@ def parse_metadata(scene: Mapping[str, Any], where: object) -> tuple[Metadata, C
     try:
         if "aabb" not in scene:
             return ImageMetadata(*checks.check_view_size(where, "resolution", *scene["resolution"])), None, None
-        near, far, pixel = (
-            None if scene[key] is None else checks.parse_number(where, key, scene[key])
-            for key in ("near", "far", "pixel")
-        )
+        limits = {key: scene[key] for key in ("near", "far", "pixel")}
+        near, far, pixel = (None if x is None else checks.parse_number(where, key, x) for key, x in limits.items())
         checks.check_near_far(where, near, far)
         aabb = torch.from_numpy(checks.check_box(where, "aabb", scene["aabb"])).float()
         red, green, blue = checks.parse_array(where, "background", scene["background"], 3).tolist()
@@ -110,7 +108,6 @@ def parse_cameras(where: object, key: str, views: Mapping[str, Any]) -> Cameras:
     if not len(c2w) or K.shape not in ((3, 3), (len(c2w), 3, 3)):
         found = f"shape {K.shape} for {len(c2w)} views"
         raise InputError(where, f"{key}K", found, "shape (V, 3, 3) with at least one view")
-    K = np.stack(
-        [checks.check_intrinsics(where, f"{key}K", one, width, height) for one in np.broadcast_to(K, (len(c2w), 3, 3))]
-    )
+    matrices = np.broadcast_to(K, (len(c2w), 3, 3))
+    K = np.stack([checks.check_intrinsics(where, f"{key}K", matrix, width, height) for matrix in matrices])
     return Cameras.pinhole(torch.from_numpy(K).float(), torch.from_numpy(c2w).float(), width, height)

@@ -31,22 +31,18 @@ def write_report(result: dict[str, Any], cfg: DictConfig, output: Path) -> None:
 def explain_choice(result: dict[str, Any], output: Path) -> str:
     """Summarizes the choice, its reason and its files for the terminal."""
     target, rung = result["target"], str(result["rung"])
-    lines = [
-        f"rung {number} reaches {entry['psnr']:.2f} dB trained in full" for number, entry in result["full"].items()
-    ]
+    lines = [f"rung {name} reaches {entry['psnr']:.2f} dB trained in full" for name, entry in result["full"].items()]
     if target["psnr"] is None:
         goal = f"{target['within_db']:g} dB below the best are allowed"
     else:
         goal = f"the target of {target['psnr']:g} dB was {'' if result['reached'] else 'not '}reached"
     lines[-1] += f"; {goal}: rung {rung}"
     ratio = result["search_seconds"] / result["full"][rung]["seconds"]
-    lines.append(
+    lines += [
         f"{output}/compact.npz: {format_figures(result['psnr'], result['artifact_bytes'])}; the search took"
-        f" {result['search_seconds']:.0f} s of training, {ratio:.1f} times that of the choice"
-    )
-    lines.append(
-        f"again: nerf_lightning train +experiment={output}/best.yaml; all rungs: {output}/chart.png, {REPORT_FILE}"
-    )
+        f" {result['search_seconds']:.0f} s of training, {ratio:.1f} times that of the choice",
+        f"again: nerf_lightning train +experiment={output}/best.yaml; all rungs: {output}/chart.png, {REPORT_FILE}",
+    ]
     return "\n".join(lines)
 
 

@@ -188,9 +188,8 @@ def climb_ladder(
     for number, options in enumerate(ladder):
         part = configure_rung(cfg, ladder, number)
         model = build.resolve_config(part.model)
-        system, seconds = train_rung(
-            part, data, folder, systems[-1] if systems and is_larger_model(model, previous) else None
-        )
+        smaller = systems[-1] if systems and is_larger_model(model, previous) else None
+        system, seconds = train_rung(part, data, folder, smaller)
         parameters = sum(p.numel() for p in system.parameters() if p.requires_grad)
         rung = RungResult(measure_psnr(system, data), estimate_compact_bytes(part, system, data), parameters, seconds)
         print(f"rung {number}: {format_options(options)}: {format_figures(rung.psnr, rung.size)}", flush=True)

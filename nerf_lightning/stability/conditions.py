@@ -13,15 +13,7 @@ from nerf_lightning.config import conf_dir
 from nerf_lightning.dataset.pixel_datamodule import Picture
 from nerf_lightning.dataset.scene import BUILT_IN, Scene
 from nerf_lightning.dataset.views import Views
-from nerf_lightning.synthetic import corruptions
-from nerf_lightning.synthetic.objects import (
-    MARBLE,
-    PILE,
-    ROD,
-    make_hemisphere_cameras,
-    make_object_scene,
-    render_photos,
-)
+from nerf_lightning.synthetic import corruptions, objects
 from nerf_lightning.synthetic.rooms import ROOMS, make_room_scene
 
 UPSCALE_FACTOR = 2
@@ -31,14 +23,15 @@ UPSCALE_FACTOR = 2
 @cache
 def make_subject(seed: int) -> Scene:
     """The pile, shared by all seeds; never modified in place."""
-    return make_object_scene(PILE)
+    return objects.make_object_scene(objects.PILE)
 
 
 def make_closeup(seed: int) -> Scene:
     """The pile, with held-out views closer than the training views."""
     scene = make_subject(0)
-    cameras = make_hemisphere_cameras(len(scene.val), scene.val.cameras.width, phase=0.7, distance=2.4)
-    return replace(scene, val=Views.from_images(render_photos(PILE, cameras, scene.background), cameras))
+    cameras = objects.make_hemisphere_cameras(len(scene.val), scene.val.cameras.width, phase=0.7, distance=2.4)
+    photos = objects.render_photos(objects.PILE, cameras, scene.background)
+    return replace(scene, val=Views.from_images(photos, cameras))
 
 
 def make_waves(width: int = 48, height: int = 48) -> Picture:
@@ -59,11 +52,11 @@ def make_uniform_image() -> Picture:
 
 SCENES: dict[str, Callable[[int], Scene | Picture]] = {
     "pile": make_subject,
-    "pile with alpha": lambda seed: make_object_scene(PILE, None),
+    "pile with alpha": lambda seed: objects.make_object_scene(objects.PILE, None),
     "pile seen from nearer": make_closeup,
-    "marble on white": lambda seed: make_object_scene(MARBLE, (1.0, 1.0, 1.0)),
-    "marble on black": lambda seed: make_object_scene(MARBLE),
-    "rod": lambda seed: make_object_scene(ROD),
+    "marble on white": lambda seed: objects.make_object_scene(objects.MARBLE, (1.0, 1.0, 1.0)),
+    "marble on black": lambda seed: objects.make_object_scene(objects.MARBLE),
+    "rod": lambda seed: objects.make_object_scene(objects.ROD),
     "small subject": lambda seed: make_room_scene(ROOMS["small subject"], seed),
     "plain floor": lambda seed: make_room_scene(ROOMS["plain floor"], seed),
     "waves": lambda seed: make_waves(),

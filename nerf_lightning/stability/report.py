@@ -60,13 +60,10 @@ def judge_trials(results: Sequence[TrialResult]) -> list[Verdict]:
     for condition in CONDITIONS.values():
         for method in dict.fromkeys(result.method for result in results):
             seeds = select_results(results, condition.name, method)
-            failed = [
-                result
-                for result in seeds
-                if not is_passed(result, condition, get_clean_psnr(results, method, result.seed))
-            ]
+            clean = {result.seed: get_clean_psnr(results, method, result.seed) for result in seeds}
+            failed = tuple(result for result in seeds if not is_passed(result, condition, clean[result.seed]))
             if seeds:
-                verdicts.append(Verdict(condition, method, tuple(seeds), tuple(failed)))
+                verdicts.append(Verdict(condition, method, tuple(seeds), failed))
     return verdicts
 
 
@@ -86,14 +83,11 @@ def find_rescues(results: Sequence[TrialResult]) -> list[bool]:
     """
     rescues = []
     for control in results:
-        recovery_twin = METHODS[control.method].recovery_twin
-        twins = (
-            select_results(results, control.condition, recovery_twin, control.seed) if recovery_twin is not None else []
-        )
+        twin = METHODS[control.method].recovery_twin
+        twins = [] if twin is None else select_results(results, control.condition, twin, control.seed)
         if twins and control.status in ("collapsed", "failed"):
-            undisturbed = compute_median_psnr(
-                select_results(results, control.condition, control.method)
-            ) or get_clean_psnr(results, control.method)
+            others = select_results(results, control.condition, control.method)
+            undisturbed = compute_median_psnr(others) or get_clean_psnr(results, control.method)
             psnr = twins[0].psnr
             rescues.append(psnr is not None and undisturbed is not None and psnr >= undisturbed - MAX_RESCUE_LOSS_DB)
     return rescues
@@ -148,18 +142,13 @@ def summarize(verdicts: Sequence[Verdict], rescues: Sequence[bool]) -> list[str]
     shipped = [verdict for verdict in verdicts if not verdict.condition.control and not METHODS[verdict.method].control]
     controls, lines = [verdict for verdict in verdicts if is_expected_to_fail(verdict)], []
     if shipped:
-        failed, total = (
-            sum(len(verdict.failed) for verdict in shipped),
-            sum(len(verdict.results) for verdict in shipped),
-        )
+        failed = sum(len(verdict.failed) for verdict in shipped)
+        total = sum(len(verdict.results) for verdict in shipped)
         lines.append(f"shipped recipes: {failed} of {total} trials failed")
     if controls:
-        failing = [
-            f"{verdict.condition.name}, {verdict.method} ({verdict.describe()[-1]})"
-            for verdict in controls
-            if verdict.failed
-        ]
-        listed = "; ".join(failing) or "none, so this suite proves nothing"
+        failing = [v for v in controls if v.failed]
+        names = "; ".join(f"{v.condition.name}, {v.method} ({v.describe()[-1]})" for v in failing)
+        listed = names or "none, so this suite proves nothing"
         lines.append(f"controls that failed, as they should: {listed}")
     if rescues:
         number = f"{sum(rescues)} of {len(rescues)} diverged control runs"

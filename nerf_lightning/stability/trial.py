@@ -120,21 +120,14 @@ def train_trial(trial: Trial, folder: Path) -> dict[str, Any]:
     if condition.is_2d:
         path = folder / "image.png"
         write_png(path, scene.image.numpy())
-        overrides = [
-            "callbacks.pictures=null",
-            f"dataset.max_side={max(scene.size) // UPSCALE_FACTOR}",
-            f"render.scale={UPSCALE_FACTOR}",
-        ]
+        max_side = max(scene.size) // UPSCALE_FACTOR
+        overrides = ["callbacks.pictures=null", f"dataset.max_side={max_side}", f"render.scale={UPSCALE_FACTOR}"]
     else:
         path = folder / "scene.npz"
         save_npz(scene, path)
         overrides = ["dataset=photos", "callbacks.orbit=null"]
-    overrides += [
-        *(method.get_options_for(condition) or []),
-        make_override("dataset.path", path),
-        f"seed={trial.seed}",
-        f"budget.steps={trial.steps}",
-    ]
+    overrides += [*(method.get_options_for(condition) or []), make_override("dataset.path", path)]
+    overrides += [f"seed={trial.seed}", f"budget.steps={trial.steps}"]
     overrides += ["threads=1", "device=cpu"]  # trials are small and run in parallel
     overrides += ["~logger", "callbacks.snapshots.steps=[]", "callbacks.validation=null", "callbacks.checkpoints=null"]
     outcome: dict[str, Any] = {"psnr": None, "status": "failed", "diagnosis": "", "recoveries": 0, "alarm": ""}

@@ -49,9 +49,7 @@ class Solids(NamedTuple):
 
     def to_float32(self) -> "Solids":
         """Casts the geometry to single precision."""
-        return self._replace(
-            **{name: getattr(self, name).astype(np.float32) for name in ("center", "half_size", "axes")}
-        )
+        return self._replace(**{key: getattr(self, key).astype(np.float32) for key in ("center", "half_size", "axes")})
 
 
 @functools.cache

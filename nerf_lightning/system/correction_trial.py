@@ -173,9 +173,8 @@ def measure_error_reductions(
         exposure: also measures exposure; poses alone are faster.
     """
     photos = subsample(len(views), MAX_PHOTOS)
-    fit_pixels, test_pixels = (
-        sample_photo_pixels(views, photos, PIXELS_PER_PHOTO, background, generator) for _ in range(2)
-    )
+    draw = partial(sample_photo_pixels, views, photos, PIXELS_PER_PHOTO, background, generator)
+    fit_pixels, test_pixels = draw(), draw()
     residuals, jacobian = compute_residual_jacobian(render, corrections, fit_pixels, len(photos))
 
     def errors(pose_adjustment: Tensor | None, log_gains: Tensor | None) -> Float[Tensor, "V"]:
@@ -240,14 +239,12 @@ class CorrectionTrials(L.Callback):
         views = pl_module.datamodule.scene.train.to(pl_module.device)
         generator = step_generator(pl_module.seed, Stream.REFINEMENT_TRIAL, step, pl_module.device)
         background, exposure = pl_module.renderer.background.color, "exposure" in candidates
-        measure = partial(
-            measure_error_reductions, freeze_renderer(pl_module), views, background, corrections, generator, exposure
-        )
+        arguments = freeze_renderer(pl_module), views, background, corrections, generator, exposure
+        measure = partial(measure_error_reductions, *arguments)
         reductions = measure()
         if select_corrections(candidates, step, reductions, RETEST_FRACTION):
             draws = [reductions, *(measure() for _ in range(NUM_DRAWS - 1))]
             reductions = {name: fmean(draw[name] for draw in draws) for name in reductions}
         selected = select_corrections(candidates, step, reductions)
-        corrections.record_trial(
-            progress, selected, {name: reductions[name] for name in candidates}, reductions.get("exif", 0.0) > 0
-        )
+        measured = {name: reductions[name] for name in candidates}
+        corrections.record_trial(progress, selected, measured, reductions.get("exif", 0.0) > 0)

@@ -64,14 +64,8 @@ class FieldGrowth(L.Callback):
 def warm_up_compile(system: "NeRF3D", batch: RayBatch) -> None:
     """Runs a step on a copy with the clock paused: compiling for a new size does not count as training."""
     field, sampler = copy.deepcopy(system.field), copy.deepcopy(system.sampler)
-    options = (
-        system.make_optimizer,
-        system.schedule,
-        system.seed,
-        system.chunk,
-        system.corrections,
-        system.compile_backend,
-    )
+    training = system.make_optimizer, system.schedule, system.seed
+    options = *training, system.chunk, system.corrections, system.compile_backend
     shadow = type(system)(field, sampler, system.renderer, *options)
     with system.state.clock.pause(), system.trainer.precision_plugin.train_step_context():
         generator = step_generator(system.seed, Stream.STEP, system.global_step, system.device)

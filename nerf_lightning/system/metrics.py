@@ -60,8 +60,7 @@ def ssim(
     for start in range(0, height, chunk_rows):
         end = min(start + chunk_rows, height)
         top, bottom = max(0, start - margin), min(height, end + margin)
-        _, scores = structural_similarity_index_measure(
-            first[:, :, top:bottom], second[:, :, top:bottom], data_range=1.0, return_full_image=True
-        )
+        a, b = (x[:, :, top:bottom] for x in (first, second))
+        _, scores = structural_similarity_index_measure(a, b, data_range=1.0, return_full_image=True)
         total += scores[0, :, start - top : end - top][:, valid[start:end]].double().sum().item()
     return total / (3 * int(valid.sum())) if valid.any() else math.nan

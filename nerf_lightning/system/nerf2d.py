@@ -26,9 +26,8 @@ class NeRF2D(System):
 
     def loss(self, batch: PixelBatch) -> Float[Tensor, ""]:
         """Mean squared error of the batch."""
-        return torch.nn.functional.mse_loss(
-            maybe_compile(self.field.forward, self.compile_backend)(batch.uv), batch.rgb
-        )
+        rgb = maybe_compile(self.field.forward, self.compile_backend)(batch.uv)
+        return torch.nn.functional.mse_loss(rgb, batch.rgb)
 
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:
         loss = self.loss(batch)

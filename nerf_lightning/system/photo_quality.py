@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -44,11 +45,9 @@ ALIGN_COST_PIXELS = 2 * ((JOINT_STEPS + PER_CAMERA_STEPS) * ALIGN_PIXELS * 5 + S
 
 def measure_photo_psnr(system: NeRF3D, views: Views) -> list[float]:
     """PSNR in dB of each training photo as corrected, on a sample of its pixels; nan where none is known."""
-    views = views.to(system.device)
+    views, background = views.to(system.device), system.renderer.background.color
     generator = step_generator(system.seed, Stream.ANALYSIS, 2, system.device)
-    pixels = sample_photo_pixels(
-        views, range(len(views)), PIXELS_PER_PHOTO, system.renderer.background.color, generator
-    )
+    pixels = sample_photo_pixels(views, range(len(views)), PIXELS_PER_PHOTO, background, generator)
     squared_errors = compute_photo_errors(lambda rays, _: system.render(rays), system.corrections, pixels, len(views))
     known = pixels.known.view(len(views), -1).sum(1)
     return [mse_to_psnr(mse) for mse in (squared_errors / (3 * known)).tolist()]
@@ -87,24 +86,16 @@ def measure_aligned_psnr(system: NeRF3D, views: Views, fraction: float = 1.0) ->
     squared_errors, known = torch.zeros(2, len(views), dtype=torch.float64)
     num_pixels = max(MIN_ALIGN_PIXELS, round(fraction * ALIGN_PIXELS))
     for half, other in zip(IMAGE_HALVES, IMAGE_HALVES[::-1], strict=True):
-        corrections = system.corrections.make_held_out_corrections(views.cameras, system.sampler.bounds).to(
-            system.device
-        )
+        corrections = system.corrections.make_held_out_corrections(views.cameras, system.sampler.bounds)
+        corrections.to(system.device)
         generator = step_generator(system.seed, Stream.ANALYSIS, 1, system.device)
-        draw = partial(
-            sample_photo_pixels,
-            views,
-            num_pixels=num_pixels,
-            background=background,
-            generator=generator,
-            column_range=half,
-        )
+        options: dict[str, Any] = {"background": background, "generator": generator, "column_range": half}
+        draw = partial(sample_photo_pixels, views, num_pixels=num_pixels, **options)
         align_cameras(freeze_renderer(system), corrections, draw)
         for view in range(len(views)):
             pixels = sample_photo_pixels(views, [view], SCORED_PIXELS, background, generator, other)
-            squared_errors[view] += float(
-                compute_photo_errors(lambda rays, _: system.render(rays), corrections, pixels, 1)
-            )
+            errors = compute_photo_errors(lambda rays, _: system.render(rays), corrections, pixels, 1)
+            squared_errors[view] += float(errors)
             known[view] += 3 * int(pixels.known.sum())
     return [mse_to_psnr(mse) for mse in (squared_errors / known.clamp_min(1)).tolist()]
 
@@ -126,9 +117,8 @@ def align_cameras(render: RenderFn, corrections: Corrections, draw: Callable[[Se
         residuals, jacobian = (torch.cat(parts) for parts in zip(*terms, strict=True))
         update = torch.zeros_like(jacobian[:, 0])
         if step < JOINT_STEPS:
-            shared = solve_damped_least_squares(
-                residuals.flatten(0, 1)[None], (jacobian[..., POSES] @ common).flatten(0, 1)[None]
-            )
+            jacobian_of_all = (jacobian[..., POSES] @ common).flatten(0, 1)
+            shared = solve_damped_least_squares(residuals.flatten(0, 1)[None], jacobian_of_all[None])
             update[:, POSES] = (common @ shared.mT)[..., 0]
             if exposure:
                 update[:, EXPOSURE] = solve_damped_least_squares(residuals, jacobian[..., EXPOSURE])

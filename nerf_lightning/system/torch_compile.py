@@ -35,9 +35,8 @@ def _assume_constant(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @torch._dynamo.assume_constant_result
     def call_boxed(*args: Any) -> list[Any]:  # in a list: one graph cannot take two single tensors of the same name
-        return [
-            tree_map_only(torch.Tensor, lambda x: torch.nn.Parameter(x.clone(), requires_grad=False), function(*args))
-        ]
+        outputs = function(*args)
+        return [tree_map_only(torch.Tensor, lambda x: torch.nn.Parameter(x.clone(), requires_grad=False), outputs)]
 
     def call_unboxed(*args: Any) -> Any:
         return call_boxed(*args)[0]

@@ -11,15 +11,9 @@ from omegaconf.errors import OmegaConfBaseException
 
 from nerf_lightning.config.options import check_run_options
 from nerf_lightning.errors import DiskFullError, InputError
+from nerf_lightning.runs import run_lock
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
 from nerf_lightning.runs.folder import config_to_dict, save_config
-from nerf_lightning.runs.run_lock import (
-    RunFolderInUse,
-    has_run_outputs,
-    is_rank_zero,
-    lock_folder,
-    make_run_exists_error,
-)
 from nerf_lightning.runs.summaries import FINISHED, RunSummary, find_runs, read_run
 from nerf_lightning.training.sweep import ERROR_FILE, write_table
 from nerf_lightning.training.train import train
@@ -39,21 +33,21 @@ def run_job(cfg: DictConfig) -> float | None:
     folder = Path(HydraConfig.get().runtime.output_dir)
     root = Path(HydraConfig.get().sweep.dir)
     try:
-        with handle_signals(), lock_folder(folder):  # may run in a launcher's process
+        with handle_signals(), run_lock.lock_folder(folder):  # may run in a launcher's process
             try:
                 return continue_job(cfg, folder)
             except Exception as error:  # noqa: BLE001  (recorded with its traceback; the other jobs must go on)
-                if is_rank_zero():
+                if run_lock.is_rank_zero():
                     record_error(folder, cfg, error)
                 if is_disk_full(error):  # later jobs would fail too
                     raise
                 return None
-    except RunFolderInUse as error:  # as by the same command, run twice at a time
+    except run_lock.RunFolderInUse as error:  # as by the same command, run twice at a time
         print(f"{folder.name}: {error}", file=sys.stderr, flush=True)
         return None
     finally:
         with suppress(InputError):  # interrupted before any job wrote, or a full disk, reported already
-            if is_rank_zero():
+            if run_lock.is_rank_zero():
                 write_table(root, find_runs(root))
 
 
@@ -61,11 +55,11 @@ def continue_job(cfg: DictConfig, folder: Path) -> float | None:
     """Skips, resumes or starts a job in a folder that this process has locked. Returns the held-out PSNR in dB."""
     check_run_options(cfg, HydraConfig.get().runtime.choices)
     previous = read_run(folder)
-    has_other_run = has_run_outputs(folder) and previous.config != config_to_dict(cfg)
+    has_other_run = run_lock.has_run_outputs(folder) and previous.config != config_to_dict(cfg)
     if has_other_run and previous.status != "failed" and not cfg.overwrite:
-        raise make_run_exists_error(folder)
+        raise run_lock.make_run_exists_error(folder)
     finished, checkpoint = find_progress(previous, cfg)
-    if is_rank_zero():
+    if run_lock.is_rank_zero():
         for name in (ERROR_FILE,) if finished is not None else (ERROR_FILE, "results.json"):
             remove_path(folder / name)
     if finished is not None:
@@ -103,7 +97,7 @@ def record_error(folder: Path, cfg: DictConfig, error: Exception) -> None:
         if not (folder / "config.yaml").exists():
             with suppress(OmegaConfBaseException):  # the configuration itself may be what failed
                 save_config(cfg, folder)
-        if not isinstance(error, RunFolderInUse) and read_run(folder).status != "failed":
+        if not isinstance(error, run_lock.RunFolderInUse) and read_run(folder).status != "failed":
             results = {"method": cfg.get("method"), "seed": cfg.get("seed"), "status": "failed", "diagnosis": diagnosis}
             write_json(folder / "results.json", results | {"psnr": None, "curve": [], "warnings": [], "recoveries": []})
         write_text(folder / ERROR_FILE, "".join(traceback.format_exception(error)))

@@ -72,9 +72,8 @@ def log_summary(logger: Logger, options: Mapping[str, Any], results: Mapping[str
         logger.log_summary(options, results)
         return
     logger.log_hyperparams({key: options[key] for key in LOGGED_OPTIONS if options.get(key) is not None})
-    logger.log_metrics(
-        {f"final/{key}": results[key] for key in LOGGED_METRICS if results[key] is not None}, results["steps"]
-    )
+    metrics = {f"final/{key}": results[key] for key in LOGGED_METRICS if results[key] is not None}
+    logger.log_metrics(metrics, results["steps"])
     logger.finalize("success")
 
 

@@ -36,12 +36,8 @@ def compose_resumed_config(cfg: DictConfig, folder: Path) -> tuple[DictConfig, P
         if OmegaConf.select(saved, key, default=key) is key:
             raise InputError("resume", key, "the run has no such option", hint=f"see {folder}/config.yaml")
         value = OmegaConf.select(cfg, key)
-        OmegaConf.update(
-            saved,
-            key,
-            escape_interpolations(resolve_config(value) if isinstance(value, DictConfig) else value),
-            merge=False,
-        )
+        literal = escape_interpolations(resolve_config(value) if isinstance(value, DictConfig) else value)
+        OmegaConf.update(saved, key, literal, merge=False)
     if "device" in overridden_keys:  # the trainer's was resolved when the run began
         OmegaConf.update(saved, "trainer.accelerator", cfg.trainer.accelerator)
     return saved, checkpoint

@@ -43,10 +43,8 @@ class SweepReport(Callback):
         from nerf_lightning.comparison.report import write_comparison
 
         root = Path(config.hydra.sweep.dir)
-        runs = find_runs(root)
-        unfinished = [
-            run for run in runs if run.status not in (*FINISHED, "stopped_early") or (run.folder / ERROR_FILE).exists()
-        ]
+        runs, done = find_runs(root), (*FINISHED, "stopped_early")
+        unfinished = [run for run in runs if run.status not in done or (run.folder / ERROR_FILE).exists()]
         try:
             write_comparison(runs, root, read_references(PUBLISHED_FILE))
             print(f"{root / TABLE_FILE}: one row per job")

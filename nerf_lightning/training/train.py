@@ -17,15 +17,7 @@ from omegaconf import DictConfig
 from nerf_lightning.callbacks import Budget, LiveViewer
 from nerf_lightning.callbacks.results import summarize_run
 from nerf_lightning.callbacks.trainer_access import find_callback
-from nerf_lightning.config.build import (
-    build_system,
-    build_trainer,
-    check_groups,
-    get_metadata,
-    has_pose_refinement,
-    resolve_config,
-    resolve_run_device,
-)
+from nerf_lightning.config import build
 from nerf_lightning.config.limits import get_limits
 from nerf_lightning.dataset import DataModule, Scene
 from nerf_lightning.errors import DiskFullError, InputError
@@ -93,12 +85,12 @@ def train(
 
 def prepare(cfg: DictConfig) -> torch.device:
     """Sets up the process and checks the options of all groups. Returns the device."""
-    device = resolve_run_device(cfg)
+    device = build.resolve_run_device(cfg)
     silence_lightning()
     prepare_process(cfg, may_compile=True)
     if cfg.compile:
         check_compiler(device, COMPILE_BACKEND)
-    check_groups(cfg)
+    build.check_groups(cfg)
     return device
 
 
@@ -107,11 +99,11 @@ def build_run(
 ) -> TrainingRun:
     """Builds system and trainer, checks that they fit the data, and empties the folder unless a run continues."""
     data.scale_batch(get_limits(cfg, device).batch_scale)
-    issues = data.find_issues(has_pose_refinement(cfg))
+    issues = data.find_issues(build.has_pose_refinement(cfg))
     for issue in issues:
         log.warning("%s: %s", data.scene.name, issue.text)
     system = prepare_system(cfg, data, device, any(issue.has_wrong_poses for issue in issues))
-    trainer = build_trainer(cfg, folder, device)
+    trainer = build.build_trainer(cfg, folder, device)
     check_processes(trainer)
     for callback in trainer.callbacks:  # type: ignore[attr-defined]
         if check := getattr(callback, "check", None):
@@ -139,7 +131,7 @@ def prepare_system(cfg: DictConfig, data: DataModule, device: torch.device, has_
     Raises:
         InputError: if it needs more memory than is free, at its largest, or does not fit the data.
     """
-    system = build_system(cfg, get_metadata(data), device)
+    system = build.build_system(cfg, build.get_metadata(data), device)
     contents = "numbers, with their gradients and moments,"
     check_memory("config", "model", contents, system.field.training_bytes, "choose a smaller one", device)
     if system.corrections is not None and has_wrong_poses:
@@ -186,14 +178,13 @@ def fit(run: TrainingRun, checkpoint: Path | None) -> None:
 
 def has_trained(trainer: L.Trainer, error: BaseException) -> bool:
     """Whether an error came after the start of training, and not from a first step that ran out of memory."""
-    return Budget.find(trainer).state.clock.has_started and not (
-        trainer.global_step == 0 and out_of_memory_error(error)
-    )
+    clock = Budget.find(trainer).state.clock
+    return clock.has_started and not (trainer.global_step == 0 and out_of_memory_error(error))
 
 
 def summarize(run: TrainingRun, results: dict[str, Any]) -> None:
     """Saves refined cameras, logs the final metrics, and prints the results."""
     report_photos(run.system, run.data, results, run.folder)
     if run.trainer.logger is not None:
-        log_summary(run.trainer.logger, resolve_config(run.cfg), results)
+        log_summary(run.trainer.logger, build.resolve_config(run.cfg), results)
     report_results(results, run.folder, run.trainer.logger)

@@ -88,9 +88,8 @@ def is_disk_full(error: BaseException | None) -> bool:
 
 
 def disk_full_error(where: object) -> DiskFullError:
-    return DiskFullError(
-        where, "", "no space left on the device", hint="free some and continue: existing files are unchanged"
-    )
+    hint = "free some and continue: existing files are unchanged"
+    return DiskFullError(where, "", "no space left on the device", hint=hint)
 
 
 def write_text(path: Path, text: str) -> None:

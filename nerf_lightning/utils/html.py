@@ -25,15 +25,13 @@ def render_page(template: Path, styles: Sequence[Path] = (), scripts: Sequence[P
         values: of the template, with `title`.
     """
     loader = FileSystemLoader([template.parent, TEMPLATE_FOLDER])
-    environment = Environment(
-        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    jinja = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     texts = {"style": (TEMPLATE_FOLDER / "page.css", *styles), "script": scripts}
     for name, files in texts.items():
         text = "\n".join(map(read_minified, files))
         digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
         values |= {name: Markup(text), f"{name}_hash": f"sha256-{digest}"}  # for the content security policy
-    return environment.get_template(template.name).render(values)
+    return jinja.get_template(template.name).render(values)
 
 
 def read_minified(file: Path) -> str:

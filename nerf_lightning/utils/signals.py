@@ -59,11 +59,8 @@ def exit_on_signal() -> Iterator[None]:
             if _received_signal is None:
                 raise
             hint = error.hint if isinstance(error, SignalInterrupt) else RESUME_HINT
-            print(
-                f"nerf_lightning: interrupted ({signal.Signals(_received_signal).name}); {hint}",
-                file=sys.stderr,
-                flush=True,
-            )
+            name = signal.Signals(_received_signal).name
+            print(f"nerf_lightning: interrupted ({name}); {hint}", file=sys.stderr, flush=True)
             sys.exit(128 + _received_signal)
 
 

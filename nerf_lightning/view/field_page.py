@@ -108,16 +108,13 @@ class FieldPage(Page):
         gui = self.server.gui
         if live:
             self.bar, self.progress = gui.add_progress_bar(0.0), gui.add_markdown("")
-        gui.add_markdown(
-            "Drag to turn, right-drag to move, scroll to zoom. Click into the image to see a ray's samples."
-        )
+        gui.add_markdown("Drag to turn, right-drag to move, scroll to zoom. Click the image to see a ray's samples.")
         gui.add_button("reset view").on_click(self.go_home)
         with gui.add_folder("image"):
             self.channel = gui.add_dropdown("channel", CHANNELS)
             self.background = gui.add_dropdown("background", tuple(self.backgrounds))
-            self.max_side = gui.add_slider(
-                "resolution", 64, 2048, 32, min(max(max_side, 64), 2048), hint="longer side, pixels"
-            )
+            side = min(max(max_side, 64), 2048)
+            self.max_side = gui.add_slider("resolution", 64, 2048, 32, side, hint="longer side, pixels")
             max_far = float(f"{3 * self.scale:.2g}")
             step = max_far / 200
             self.near = gui.add_slider("near", 0.0, max_far, step, 0.0, hint="hide what is nearer")
@@ -168,9 +165,8 @@ class FieldPage(Page):
             self.points("/ray/samples", positions.cpu().numpy(), parse_hex_color(VERMILLION), 0.006)
         color = ", ".join(f"{float(c):.2f}" for c in rendered.rgb[0])
         depth, opacity = float(rendered.depth[0]), float(rendered.opacity[0])
-        self.status.content = (
-            f"clicked: {len(samples)} samples, color {color}, opacity {opacity:.2f}, depth {depth:.3f}"
-        )
+        values = f"color {color}, opacity {opacity:.2f}, depth {depth:.3f}"
+        self.status.content = f"clicked: {len(samples)} samples, {values}"
 
     def build_request(self, client_state: ClientState) -> ViewRequest:
         """The image that a client currently requests."""
@@ -179,10 +175,9 @@ class FieldPage(Page):
         c2w[:3, :3] = SO3(camera.wxyz).as_matrix()
         c2w[:3, 3] = camera.position
         far = self.far.value if self.far.value < self.far.max else math.inf
-        background = self.backgrounds[self.background.value]
-        return ViewRequest(
-            c2w, camera.fov, camera.aspect, self.channel.value, background, self.near.value, far, self.max_side.value
-        )
+        channel, background = self.channel.value, self.backgrounds[self.background.value]
+        lens = camera.fov, camera.aspect
+        return ViewRequest(c2w, *lens, channel, background, self.near.value, far, self.max_side.value)
 
     def next_client(self) -> ClientState | None:
         """The client with the coarsest image; None if all images have full resolution."""

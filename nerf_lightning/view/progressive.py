@@ -83,9 +83,8 @@ class ProgressiveRenderer:
 
     def render(self, request: ViewRequest, side: int, is_current: Callable[[], bool]) -> UInt8[ndarray, "H W 3"] | None:
         """Renders a request at one resolution; None if canceled by `is_current`."""
-        style = FrameStyle(
-            (request.channel,), request.background, self.get_depth_range() if request.channel == "depth" else (0.0, 1.0)
-        )
+        depths = self.get_depth_range() if request.channel == "depth" else (0.0, 1.0)
+        style = FrameStyle((request.channel,), request.background, depths)
         device, batch_size = self.system.device, CHUNKS_PER_CHECK * self.system.chunk_rays
         synchronize(device)  # exclude queued work from the timing
         began = time.perf_counter()
@@ -95,9 +94,8 @@ class ProgressiveRenderer:
         for start in range(0, len(rays), batch_size):
             if not is_current():
                 return None
-            rendered = self.system.render(
-                rays[start : start + batch_size], request.near, request.far, request.background
-            )
+            chunk = rays[start : start + batch_size]
+            rendered = self.system.render(chunk, request.near, request.far, request.background)
             parts.append(render_channel(rendered, request.channel, style))
         image = to_uint8(torch.cat(parts).view(cameras.height, cameras.width, 3))
         self.rays_per_second = 0.5 * self.rays_per_second + 0.5 * len(rays) / max(time.perf_counter() - began, 1e-4)

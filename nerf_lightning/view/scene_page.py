@@ -4,15 +4,7 @@ import torch
 
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.drawing.style import GRAY, GREEN, MAUVE, SKY, VERMILLION, parse_hex_color
-from nerf_lightning.view.geometry import (
-    build_ray_figure,
-    color_points,
-    compute_box_edges,
-    compute_path_segments,
-    get_home_viewpoint,
-    get_overview_viewpoint,
-    sample_random_rays,
-)
+from nerf_lightning.view import geometry
 from nerf_lightning.view.page import Page
 
 
@@ -25,8 +17,8 @@ class ScenePage(Page):
     """
 
     def __init__(self, scene: Scene, host: str, port: int):
-        _, distance = get_home_viewpoint(scene.orbit)
-        super().__init__(scene.name, get_overview_viewpoint(scene), distance, host, port)
+        _, distance = geometry.get_home_viewpoint(scene.orbit)
+        super().__init__(scene.name, geometry.get_overview_viewpoint(scene), distance, host, port)
         self.scene = scene
         self.seed = 0
         """Seed of the random pixels."""
@@ -40,9 +32,9 @@ class ScenePage(Page):
     def _add_geometry(self) -> None:
         scene = self.server.scene
         if self.scene.points is not None:
-            self.points("/points", *color_points(self.scene.points, self.scene.train), 0.006)
-        self.draw_lines("/orbit", compute_path_segments(self.scene.orbit), parse_hex_color(MAUVE))
-        self.draw_lines("/box", compute_box_edges(self.scene.bounds.aabb), parse_hex_color(GRAY))
+            self.points("/points", *geometry.color_points(self.scene.points, self.scene.train), 0.006)
+        self.draw_lines("/orbit", geometry.compute_path_segments(self.scene.orbit), parse_hex_color(MAUVE))
+        self.draw_lines("/box", geometry.compute_box_edges(self.scene.bounds.aabb), parse_hex_color(GRAY))
         self.points("/focus", self.home.look_at[None], parse_hex_color(VERMILLION), 0.02)
         scene.add_frame("/axes", axes_length=0.2 * self.scale, axes_radius=0.003 * self.scale)
         self.ray_group = scene.add_frame("/rays", show_axes=False)
@@ -50,10 +42,8 @@ class ScenePage(Page):
     def _add_controls(self) -> None:
         gui = self.server.gui
         counts = f"{len(self.scene.train)} training cameras (blue), {len(self.scene.val)} held out (orange)"
-        width, height = self.scene.resolution
-        gui.add_markdown(
-            f"{counts}, {width} x {height} pixels. Drag to turn, scroll to zoom; click a camera to look through it."
-        )
+        size = "{} x {} pixels".format(*self.scene.resolution)
+        gui.add_markdown(f"{counts}, {size}. Drag to turn, scroll to zoom; click a camera to look through it.")
         gui.add_button("whole scene").on_click(self.go_home)
         with gui.add_folder("show"):
             for word in ("points", "orbit", "box", "axes"):
@@ -76,8 +66,8 @@ class ScenePage(Page):
                 return
             cameras = self.scene.train.cameras
             views = torch.arange(len(cameras)).repeat_interleave(self.rays.value)
-            rays = sample_random_rays(cameras, views, torch.Generator().manual_seed(self.seed))
-            figure = build_ray_figure(rays, self.scene.bounds, self.samples.value, self.scale)
+            rays = geometry.sample_random_rays(cameras, views, torch.Generator().manual_seed(self.seed))
+            figure = geometry.build_ray_figure(rays, self.scene.bounds, self.samples.value, self.scale)
             self.draw_lines("/rays/approach", figure.approach, parse_hex_color(SKY))
             self.draw_lines("/rays/inside", figure.inside, parse_hex_color(GREEN))
             self.points("/rays/samples", figure.samples, parse_hex_color(VERMILLION), 0.006)

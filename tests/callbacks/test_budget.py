@@ -33,7 +33,7 @@ def test_budget_paused_clock_does_not_advance(clock, system, trainer_with):
 
 
 @pytest.mark.parametrize(
-    ("steps", "seconds", "step", "spent", "progress", "left", "rendering"),
+    ("steps", "seconds", "step", "spent", "share", "left", "pause"),
     [
         (200, None, 50, 30, 0.25, 90, 120),
         (200, None, 300, 30, 1, 0, 30),
@@ -43,16 +43,12 @@ def test_budget_paused_clock_does_not_advance(clock, system, trainer_with):
         (200, None, 0, 0, 0, None, 30),
     ],
 )
-def test_budget_two_limits_follow_nearer_one(
-    steps, seconds, step, spent, progress, left, rendering, clock, system, trainer_with
-):
+def test_budget_two_limits_follow_nearer(steps, seconds, step, spent, share, left, pause, clock, system, trainer_with):
     budget = Budget(steps, seconds)
     budget.on_train_start(trainer_with(budget), system)
     clock.wait(spent)
-    assert budget.progress(step) == progress and budget.seconds_left(step) == pytest.approx(left)
-    assert budget.render_allowance_seconds(step) == pytest.approx(rendering), (
-        "as long as training, and at least half a minute"
-    )
+    assert budget.progress(step) == share and budget.seconds_left(step) == pytest.approx(left)
+    assert budget.render_allowance_seconds(step) == pytest.approx(pause), "as long as training, or half a minute"
 
 
 def test_budget_exhausted_stops_training(clock, system, trainer_with):

@@ -83,14 +83,12 @@ class BrokenSystem(NeRF2D):
         self.field.colors.copy_((0.5 + (1 - error**0.5) * (truth - 0.5)).view(64, 3))
 
 
-def run(
-    system: NeRF2D, recovery: DivergenceRecovery, tmp_path: Path, steps: int = 250, picture: Picture | None = None
-) -> float:
+def run(system: NeRF2D, recovery: DivergenceRecovery, folder: Path, steps=250, image: Picture | None = None) -> float:
     """Trains and returns the last mean squared error over the picture."""
-    data = PixelDataModule(picture or stripes(), 64)
+    data = PixelDataModule(image or stripes(), 64)
     trainer = L.Trainer(
         accelerator="cpu", max_epochs=-1, logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False, limit_val_batches=0, default_root_dir=tmp_path, callbacks=[Budget(steps), recovery],
+        enable_model_summary=False, limit_val_batches=0, default_root_dir=folder, callbacks=[Budget(steps), recovery],
     )  # fmt: skip
     trainer.fit(system, data)
     view = data.get_held_out_view(0)
@@ -161,7 +159,7 @@ def test_recovery_after_max_restarts_gives_up(tmp_path: Path, capsys: pytest.Cap
 def test_recovery_constant_image_is_no_failure(tmp_path: Path):
     recovery = DivergenceRecovery(every=10, patience=30)
     plain = Picture("plain", "test", torch.full((8, 8, 3), 90, dtype=torch.uint8))
-    assert run(BrokenSystem("not at all", 0), recovery, tmp_path, picture=plain) < 1e-3
+    assert run(BrokenSystem("not at all", 0), recovery, tmp_path, image=plain) < 1e-3
     assert recovery.recoveries == []
 
 

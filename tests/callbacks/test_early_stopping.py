@@ -44,21 +44,14 @@ def scene(tmp_path: Path) -> Path:
 
 
 def run(scene: Path, folder: Path, *overrides: str) -> dict:
-    given = [
-        "dataset=photos",
-        f"dataset.path={scene}",
-        "recipe=tensorf_small",
-        "model.max_resolution=16",
-        "model.base_resolution=8",
-    ]
+    given = ["dataset=photos", f"dataset.path={scene}", "recipe=tensorf_small"]
+    given += ["model.max_resolution=16", "model.base_resolution=8"]
     given += ["budget.steps=600", "threads=1", "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "~logger"]
     train(compose_config([*given, *overrides], folder))
     return json.loads((folder / "results.json").read_text())
 
 
-def test_budget_patience_at_plateau_ends_training_early(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_budget_patience_at_plateau_ends_training_early(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     early = run(scene, tmp_path / "early", "budget.patience=2")
     assert early["status"] == "finished" and early["steps"] < 500
     plateau = early["plateau"]

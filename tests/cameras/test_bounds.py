@@ -86,9 +86,8 @@ def test_s_to_t_unbounded_steps_grow_outside_the_box():
     """A cube of half-size 2, hit, entered from inside, missed, and far behind: by hand."""
     cube = Bounds(torch.tensor([[-2.0, -2, -2], [2, 2, 2]]), unbounded=True)
     rays = rays_along_x([-8.0, 0, 0], [1.0, 0, 0], [-8.0, 5, 0], [30.0, 0, 0])
-    torch.testing.assert_close(
-        cube.content_interval(rays), torch.tensor([[6.0, 10.0], [-3.0, 1.0], [8.0, 8.0], [-32.0, -28.0]])
-    )
+    expected = torch.tensor([[6.0, 10.0], [-3.0, 1.0], [8.0, 8.0], [-32.0, -28.0]])
+    torch.testing.assert_close(cube.content_interval(rays), expected)
     # Six before the box are three half-sizes, 3 / 4 of all there is before; then two in it; ten behind it are 5 / 6.
     even = torch.tensor([[-3 / 4, 0.0, 1.0, 2.0, 2 + 1 / 2, 2 + 5 / 6]])
     t = torch.tensor([[0.0, 6.0, 8.0, 10.0, 12.0, 20.0]])

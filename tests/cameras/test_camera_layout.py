@@ -7,22 +7,17 @@ from scipy.spatial.transform import Rotation
 from nerf_lightning.cameras import CameraLayout, classify_layout
 from tests.helpers.camera_paths import CENTER, corridor, dome, forward, look_in_directions, pan, ring_poses, walk
 
+AT_ARMS_LENGTH = look_in_directions(CENTER + 0.6 * pan()[:, :3, 2], torch.linspace(0, 6, 24), torch.zeros(24))
+PANS = {"one": ring_poses(1), "pure pan": pan(), "half a pure pan": pan(degrees=180)}
+WALKS = {"walk": walk(), "arm's length": AT_ARMS_LENGTH, "corridor": corridor()}
 CASES = [
     *((f"ring {yaw}", ring_poses(yaw=yaw), CameraLayout.INWARD) for yaw in (0, 30)),
     ("high ring", ring_poses(yaw=15, elevation=60), CameraLayout.INWARD),
     ("half a ring", ring_poses(yaw=10, degrees=180), CameraLayout.INWARD),
     ("dome", dome(), CameraLayout.INWARD),
     *((f"forward {k}", forward(k), CameraLayout.FORWARD) for k in (-0.3, 0.0, 0.3)),
-    ("one", ring_poses(1), CameraLayout.PAN),
-    ("pure pan", pan(), CameraLayout.PAN),
-    ("half a pure pan", pan(degrees=180), CameraLayout.PAN),
-    ("walk", walk(), CameraLayout.WALK),
-    (
-        "arm's length",
-        look_in_directions(CENTER + 0.6 * pan()[:, :3, 2], torch.linspace(0, 6, 24), torch.zeros(24)),
-        CameraLayout.WALK,
-    ),
-    ("corridor", corridor(), CameraLayout.WALK),
+    *((name, c2w, CameraLayout.PAN) for name, c2w in PANS.items()),
+    *((name, c2w, CameraLayout.WALK) for name, c2w in WALKS.items()),
 ]
 
 

@@ -11,20 +11,11 @@ from nerf_lightning.dataset.region import find_region
 from tests.helpers.camera_paths import CENTER, RADIUS, UP, corridor, dome, forward, pan, ring_poses, walk
 
 LAYOUT_POSES = {
-    "ring": ring_poses(),
-    "framed to one side": ring_poses(yaw=20),
-    "arc": ring_poses(degrees=150),
-    "dome": dome(),
-    "converging": forward(-0.3),
-    "diverging": forward(0.2),
-    "pan": pan(),
-    "half a pan": pan(degrees=150),
-    "walk": walk(),
-    "corridor": corridor(),
-    "one": ring_poses(1),
-    "two": ring_poses(2),
+    "ring": ring_poses(), "framed to one side": ring_poses(yaw=20), "arc": ring_poses(degrees=150), "dome": dome(),
+    "converging": forward(-0.3), "diverging": forward(0.2), "pan": pan(), "half a pan": pan(degrees=150),
+    "walk": walk(), "corridor": corridor(), "one": ring_poses(1), "two": ring_poses(2),
     "all in one pose": ring_poses(1).repeat(5, 1, 1),
-}
+}  # fmt: skip
 
 
 def make_cameras(c2w: torch.Tensor) -> Cameras:

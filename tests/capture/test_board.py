@@ -43,13 +43,8 @@ def photo(print_: np.ndarray, board: Board, c2w: np.ndarray) -> np.ndarray:
 
 def eyes(count: int) -> list[np.ndarray]:
     rng = np.random.default_rng(0)
-    turns = np.linspace(0, 2 * np.pi, count, endpoint=False)
-    return [
-        make_pose(
-            [0.22 * np.cos(t), 0.22 * np.sin(t), 0.26 + 0.05 * rng.random()], [0, 0, 0], 0.3 * rng.standard_normal()
-        )
-        for t in turns
-    ]
+    places = [(0.22 * np.cos(t), 0.22 * np.sin(t)) for t in np.linspace(0, 2 * np.pi, count, endpoint=False)]
+    return [make_pose([x, y, 0.26 + 0.05 * rng.random()], [0, 0, 0], 0.3 * rng.standard_normal()) for x, y in places]
 
 
 @pytest.mark.parametrize("legacy", [False, True])

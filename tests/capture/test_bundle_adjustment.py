@@ -33,9 +33,8 @@ def bundle(photos: int = 8, noise: float = 0.0, tag_shift: float = 0.0, seed: in
 
 def test_bundle_problem_jacobian_matches_finite_differences():
     made = replace(bundle(3, noise=0.5, tag_shift=0.05), twists=1e-3 * np.arange(6.0))
-    made = replace(
-        made, lens=replace(LENS, distortion=Distortion(k1=-0.2, k2=0.05, p1=0.001, p2=-0.002, k3=0.01), fy=910.0)
-    )
+    bent = Distortion(k1=-0.2, k2=0.05, p1=0.001, p2=-0.002, k3=0.01)
+    made = replace(made, lens=replace(LENS, distortion=bent, fy=910.0))
     problem = BundleProblem(made, LENS_PARAMETERS, frozenset({0}), True)
     x = problem.start[problem.free]
     x[9:] += 1e-2 * np.random.default_rng(0).standard_normal(len(x) - 9)

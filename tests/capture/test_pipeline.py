@@ -27,9 +27,7 @@ from tests.helpers.exif_tags import encode_exif
 from tests.helpers.tag_views import SIX_TAGS, SMALL_LENS, TAG_SIZE
 
 
-def test_capture_scene_of_synthetic_photos_finds_their_cameras(
-    tag_capture: tuple[Path, Truth], packed: tuple[Path, Capture]
-):
+def test_capture_scene_synthetic_photos_finds_cameras(tag_capture: tuple[Path, Truth], packed: tuple[Path, Capture]):
     (_, truth), (folder, found) = tag_capture, packed
     entries = json.loads((folder / "cameras.json").read_text())["photos"]
     assert [entry["name"] for entry in entries] == sorted(truth.photos)
@@ -155,18 +153,11 @@ def test_read_layout_gives_corners_in_meters_or_names_file(tmp_path: Path):
     file = tmp_path / "sheet.yaml"
     file.write_text("tags: {0: {x: 0.0, y: 0.0}, 3: {x: 0.09, y: -0.02, turn: 90}}")
     layout = read_layout(file, "DICT_4X4_50", TAG_SIZE)
-    np.testing.assert_allclose(
-        layout.corners(0), TAG_SIZE / 2 * np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
-    )
+    around = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]])
+    np.testing.assert_allclose(layout.corners(0), TAG_SIZE / 2 * around)
     np.testing.assert_allclose(layout.corners(3)[0], [0.09 - TAG_SIZE / 2, -0.02 - TAG_SIZE / 2, 0], atol=1e-12)
-    for text in (
-        "tags: [1]",
-        "tags: {0: {x: 0}}",
-        "tags: {0: {x: 0, y: 0, z: 1}}",
-        "tags: {0: {x: .inf, y: 0}}",
-        "tags: [",
-    ):
-        file.write_text(text)
+    for text in ("[1]", "{0: {x: 0}}", "{0: {x: 0, y: 0, z: 1}}", "{0: {x: .inf, y: 0}}", "["):
+        file.write_text(f"tags: {text}")
         with pytest.raises(InputError, match=r"sheet\.yaml"):
             read_layout(file, "DICT_4X4_50", TAG_SIZE)
 

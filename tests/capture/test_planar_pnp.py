@@ -58,8 +58,7 @@ def test_resolve_flips_of_slow_walk_leaves_none():
 def test_resolve_flips_of_scattered_photos_keeps_their_best():
     c2w, rng = make_poses(15, 5, tilt=45), np.random.default_rng(7)
     points = SIX_TAGS.corners(4)
-    seen = [
-        (points, project_points(LENS, invert_pose(pose), points) + 0.1 * rng.standard_normal((4, 2))) for pose in c2w
-    ]
+    exact = [project_points(LENS, invert_pose(pose), points) for pose in c2w]
+    seen = [(points, pixels + 0.1 * rng.standard_normal((4, 2))) for pixels in exact]
     options = [estimate_tag_poses(LENS, TagDetection(TAG_SIZE * UNIT_SQUARE, pixels)) for _, pixels in seen]
     assert resolve_flips(options, [TAG_SIZE * UNIT_SQUARE] * 15) == [0] * 15

@@ -73,9 +73,8 @@ def test_render_check_page_shows_photos_worst_first(views: Views, tmp_path: Path
     (folder / "images/9999.png").write_bytes((folder / "images/0000.png").read_bytes())
     page = tmp_path / "page.html"
     found = check(folder, output=page, resize=64)
-    assert (
-        any(line.startswith("0009.png: blurred") for line in found) and "0009.png: blurred" in capsys.readouterr().out
-    )
+    assert any(line.startswith("0009.png: blurred") for line in found)
+    assert "0009.png: blurred" in capsys.readouterr().out
     text = page.read_text(encoding="utf-8")
     assert "14 to train on, 2 held out" in text and "16 of 64 x 64" in text
     assert "ignoring 1 photos that are not in the model: 9999.png" in text and "<b>" not in text.split("<figure")[0]

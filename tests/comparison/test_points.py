@@ -35,12 +35,9 @@ def test_compute_points_groups_by_conditions_largest_first(make_run: MakeRun):
     scene = {"name": "other", "sha256": "cd" * 32, "views": {"train": 9, "val": 2}, "resolution": [8, 6]}
     machine = {"processor": "slide rule", "cores": 2, "accelerator": None}
     runs = [
-        make_run("scene", scene=scene),
-        make_run("a", psnr=20.0),
-        make_run("b", {"model": {"width": 1}}),
+        *(make_run("scene", scene=scene), make_run("a", psnr=20.0), make_run("b", {"model": {"width": 1}})),
         make_run("white", background=[1.0, 1.0, 1.0]),
-        make_run("machine", machine=machine),
-        make_run("threads", threads=1),
+        *(make_run("machine", machine=machine), make_run("threads", threads=1)),
         make_run("gpu", device="cuda:1", machine={"accelerator": "H100"}),
         make_run("unknown", machine=None, background="nothing", scene="toy"),
     ]

@@ -52,9 +52,8 @@ def test_open_scene_model_folder_means_its_scene(views: Views, tmp_path: Path, c
     """Of several models the largest is taken."""
     folder = colmap(tmp_path / "scene", views, "colmap/sparse/1")
     few = views[torch.arange(4)]
-    write_colmap(
-        folder / "colmap/sparse/0", few.cameras.c2w.numpy(), write_photos(folder / "images", few), colmap_cameras(few)
-    )
+    names = write_photos(folder / "images", few)
+    write_colmap(folder / "colmap/sparse/0", few.cameras.c2w.numpy(), names, colmap_cameras(few))
     with caplog.at_level(logging.WARNING):
         scene = open_scene(str(folder))
     assert "sparse/1: using the largest model; others: 0" in caplog.text

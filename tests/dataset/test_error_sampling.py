@@ -26,9 +26,7 @@ def make_generator(seed: int = 0) -> Generator:
     return Generator().manual_seed(seed)
 
 
-def make_trained_sampler(
-    views: Views, errors: Tensor, share: float = 0.5, steps: int = 2 * UPDATE_EVERY
-) -> ErrorSampler:
+def make_trained_sampler(views: Views, errors: Tensor, share: float = 0.5, steps=2 * UPDATE_EVERY) -> ErrorSampler:
     """Sampler after steps with a fixed error per pixel."""
     sampler = ErrorSampler(views, share)
     for step in range(steps):

@@ -71,9 +71,8 @@ def test_read_pixels_heic_is_upright(tmp_path: Path):
     import pillow_heif
 
     file, picture = tmp_path / "a.HEIC", np.linspace(0, 255, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
-    pillow_heif.from_pillow(Image.fromarray(picture)).save(
-        file, exif=encode_exif(6, "Apple", focal_35mm=26), quality=90
-    )
+    exif = encode_exif(6, "Apple", focal_35mm=26)
+    pillow_heif.from_pillow(Image.fromarray(picture)).save(file, exif=exif, quality=90)
     for upright in (True, False):
         np.testing.assert_allclose(read_pixels(file, upright).astype(int), np.rot90(picture, -1), atol=12)
     assert b"Apple" in read_lens_tags(file)

@@ -123,9 +123,7 @@ def test_open_scene_masks_in_subfolders_match_their_photos(views: Views, tmp_pat
         hidden = 9 if name.startswith("back") else 5
         assert (~scene.train.view_mask(view)).nonzero()[:, 1].unique().tolist() == [hidden], name
     half = open_scene(str(write_subfolders(tmp_path / "half", views, ("front",))))
-    hidden = {
-        name.split("/")[0]: int((~half.train.view_mask(view)).sum()) for view, name in enumerate(half.train.names)
-    }
+    hidden = {name.split("/")[0]: int((~half.train.view_mask(i)).sum()) for i, name in enumerate(half.train.names)}
     assert hidden == {"back": 0, "front": 40}, "the other camera's masks are not taken"
 
 

@@ -28,9 +28,8 @@ def write(path: Path, picture: np.ndarray) -> Path:
     if picture.shape[-1] == 2:
         imageio.imwrite(path, picture)
     else:
-        assert cv2.imwrite(
-            str(path), picture[..., [2, 1, 0, 3][: picture.shape[-1]]] if picture.shape[-1] > 2 else picture
-        )
+        kinds = picture.shape[-1]
+        assert cv2.imwrite(str(path), picture[..., [2, 1, 0, 3][:kinds]] if kinds > 2 else picture)
     return path
 
 

@@ -111,9 +111,8 @@ def test_check_scene_suspect_scene_warns(pile: Scene):
     assert "near=3.6 clips" in issue.text
     assert check_scene(set_near_far(0.1, 40.0)(pile)) == [], "wider than the box: the box decides"
 
-    (issue,) = check_scene(
-        replace(pile, train=map_poses(pile.train, lambda c2w: c2w[[0, 1, 2, 3, 4, 4, *range(6, 24)]]))
-    )
+    twice = map_poses(pile.train, lambda c2w: c2w[[0, 1, 2, 3, 4, 4, *range(6, 24)]])
+    (issue,) = check_scene(replace(pile, train=twice))
     assert "1 of 24 training photos have the pose of another" in issue.text
 
     images, poses = pile.val.images.clone(), pile.val.cameras.c2w.clone()

@@ -68,9 +68,7 @@ def sfm_folder(photos: Path, reconstruction, tmp_path: Path, monkeypatch: pytest
     return folder, calls
 
 
-def test_reconstruct_two_cameras_gives_full_size_upright_model(
-    reconstruction, tag_capture: tuple[Path, Truth], tmp_path: Path
-):
+def test_reconstruct_two_cameras_gives_upright_model(reconstruction, tag_capture: tuple[Path, Truth], tmp_path: Path):
     reconstruction[0].write_binary(tmp_path)
     model = pycolmap.Reconstruction(tmp_path)
     images = {image.name: image for image in model.images.values() if image.has_pose}

@@ -27,9 +27,8 @@ def opengl_pose(angle: float) -> np.ndarray:
 def project_point(pose: np.ndarray, intrinsics: dict, point: np.ndarray) -> np.ndarray:
     """Projects a world point, in OpenCV's indices (pixel centers are integers)."""
     local = pose[:3, :3].T @ (point - pose[:3, 3])
-    K = np.array(
-        [[intrinsics["fl_x"], 0, intrinsics["cx"] - 0.5], [0, intrinsics["fl_y"], intrinsics["cy"] - 0.5], [0, 0, 1]]
-    )
+    fx, fy, cx, cy = (intrinsics[key] for key in ("fl_x", "fl_y", "cx", "cy"))
+    K = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]])
     distortion = np.array([intrinsics.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")])
     # y and z flip from OpenGL's camera axes to OpenCV's.
     pixel, _ = cv2.projectPoints((local * [1, -1, -1]).reshape(1, 1, 3), np.zeros(3), np.zeros(3), K, distortion)

@@ -22,15 +22,13 @@ def test_render_channel_with_background_shows_it_except_in_opacity():
     blue = (0.0, 0.0, 1.0)
     style = FrameStyle(("rgb", "depth", "opacity"), blue, (2.0, 4.0))
     rendered = render_output(torch.tensor(blue))
-    torch.testing.assert_close(
-        render_channel(rendered, "rgb", style), torch.tensor([[0, 0, 1.0], [0.5, 0, 0.5], [1, 0, 0]])
-    )
+    mixed = torch.tensor([[0, 0, 1.0], [0.5, 0, 0.5], [1, 0, 0]])
+    torch.testing.assert_close(render_channel(rendered, "rgb", style), mixed)
     near, far = torch.from_numpy(colorize_depth(np.array([2.0, 4.0]), 2.0, 4.0)) / 255
     expected = torch.stack([torch.tensor(blue), 0.5 * near + torch.tensor([0, 0, 0.5]), far])
     torch.testing.assert_close(render_channel(rendered, "depth", style), expected)
-    torch.testing.assert_close(
-        render_channel(rendered, "opacity", style), torch.tensor([[0.0], [0.5], [1.0]]).expand(3, 3)
-    )
+    gray = torch.tensor([[0.0], [0.5], [1.0]]).expand(3, 3)
+    torch.testing.assert_close(render_channel(rendered, "opacity", style), gray)
 
 
 def test_render_channel_transparent_has_straight_alpha():

@@ -19,9 +19,7 @@ def test_make_contact_sheet_lays_out_images_row_by_row():
     tops = {level: np.argwhere(bounding_box(sheet, level)).min(0).tolist() for level in levels}
     assert tops[40] == [GAP_PX, GAP_PX] and tops[80] == [GAP_PX, 2 * GAP_PX + cell]
     assert tops[120][1] == GAP_PX and tops[120][0] > GAP_PX + round(cell * 3 / 4)
-    assert bounding_box(sheet, 40)[GAP_PX : GAP_PX + round(cell * 3 / 4), GAP_PX : GAP_PX + cell].all(), (
-        "scaled to its cell"
-    )
+    assert bounding_box(sheet, 40)[GAP_PX : GAP_PX + round(cell * 3 / 4), GAP_PX : GAP_PX + cell].all(), "scaled"
     below = sheet[GAP_PX + round(cell * 3 / 4) : tops[120][0]]
     assert below[:, : GAP_PX + cell].min() < 100 and below[:, GAP_PX + cell :].min() < 100, "captions below both"
 

@@ -62,9 +62,8 @@ def test_export_html_of_a_run_and_of_its_compact_file(planes: Path, tmp_path: Pa
     facts = dict(about["facts"])
     assert facts["held-out PSNR"].endswith(" dB") and facts["training"].endswith("10 steps")
     assert len(about["photos"]["names"]) > 1
-    alone = read_about(
-        export_html(export_compact(run, max_psnr_drop=3.0, device="cpu"), output=tmp_path / "alone.html")
-    )
+    compact = export_compact(run, max_psnr_drop=3.0, device="cpu")
+    alone = read_about(export_html(compact, output=tmp_path / "alone.html"))
     assert "without photos" in capsys.readouterr().out
     assert alone["photos"] is None and alone["orbit"] == about["orbit"]
 

@@ -137,6 +137,5 @@ def test_sample_volume_cells_are_cubic():
     run.system.field.bounds = replace(run.system.field.bounds, aabb=aabb, pixel_footprint=0.02)
     volume = sample_volume(run, 20)
     assert volume.density.shape == (20, 10, 6) and sample_volume(run).density.shape[0] == 80
-    torch.testing.assert_close(
-        volume.index_to_world(torch.tensor([[9.5, 4.5, 2.5]]))[0], torch.zeros(3), atol=1e-6, rtol=0
-    )
+    center = volume.index_to_world(torch.tensor([[9.5, 4.5, 2.5]]))[0]
+    torch.testing.assert_close(center, torch.zeros(3), atol=1e-6, rtol=0)

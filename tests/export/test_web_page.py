@@ -37,18 +37,11 @@ def scene_of(unbounded: bool) -> dict[str, Any]:
     K = [[30.0, 0, 12], [0, 30, 12], [0, 0, 1]]
     c2w = make_circle_poses(torch.zeros(3), torch.tensor([0.0, 0, 1]), 3.0, 0.5, 4)
     return {
-        "format": 1,
-        "name": "made",
-        "source": "/home/somebody/photos",
-        "background": [0.1, 0.2, 0.3],
-        "aabb": [[-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]],
-        "unbounded": unbounded,
-        "near": None,
-        "far": None,
-        "pixel": None,
+        "format": 1, "name": "made", "source": "/home/somebody/photos", "background": [0.1, 0.2, 0.3],
+        "aabb": [[-1.0, -0.8, -0.6], [1.0, 0.8, 0.6]], "unbounded": unbounded, "near": None, "far": None, "pixel": None,
         "to_source": torch.eye(4).tolist(),
         "orbit": {"K": [K] * 4, "c2w": c2w.tolist(), "width": SIDE, "height": SIDE},
-    }
+    }  # fmt: skip
 
 
 def made(recipe: str, precision: str = "byte", unbounded: bool = False) -> bytes:
@@ -82,12 +75,8 @@ def browser() -> Iterator[Any]:
         pytest.skip("no Chromium here")
     sync_api = pytest.importorskip("playwright.sync_api")
     with sync_api.sync_playwright() as playwright:
-        options = [
-            "--no-sandbox",
-            "--use-angle=swiftshader",
-            "--enable-unsafe-swiftshader",
-            "--disable-background-networking",
-        ]
+        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        options += ["--disable-background-networking"]
         opened = playwright.chromium.launch(executable_path=chromium, args=options)
         yield opened
         opened.close()

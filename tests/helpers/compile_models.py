@@ -1,7 +1,7 @@
 """What torch.compile makes of fields and trainings, beside what they are without it: a process of its own, where no types are
 checked, as the checks would be compiled too. Prints what it found as JSON.
 
-python compile_models.py BACKEND FIELD... [--train FOLDER]
+python compile_models.py BACKEND FOLDER FIELD...     (trains in the folder)
 """
 
 import copy
@@ -17,6 +17,7 @@ from torch._dynamo.utils import counters
 from torch.nn.functional import normalize
 
 from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.config import build
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.kernels import set_kernels
 from nerf_lightning.model import Field, HashGridField, MLPField, TensoRFField, VoxelField
@@ -30,9 +31,7 @@ from tests.helpers.train_models import MODELS
 BOX = Bounds(torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
 FIELDS = {
     "mlp": lambda: MLPField(BOX, depth=2, width=8, skip=1, position_frequencies=2, density="exp"),
-    "hashgrid": lambda: HashGridField(
-        BOX, num_levels=3, log2_hashmap_size=8, base_resolution=3, max_resolution=12, width=8
-    ),
+    "hashgrid": lambda: HashGridField(BOX, 3, log2_hashmap_size=8, base_resolution=3, max_resolution=12, width=8),
     "tensorf": lambda: TensoRFField(BOX, 4, 4, base_resolution=6, max_resolution=10, stages=2, width=8),
     "voxels": lambda: VoxelField(BOX, base_resolution=6, max_resolution=10, stages=2),
 }
@@ -40,9 +39,7 @@ GROWTH_CASES = ((5, 13, 0.0), (40, 300, 0.0), (7, 90, 1.0), (6, 40, 1.0))
 """Rays and samples, and the progress to which a field grows before."""
 
 
-def evaluate_field(
-    field: Field, renderer: VolumeRenderer | None, rays: Rays, samples: Samples, backend: str | None
-) -> list:
+def evaluate_field(field: Field, renderer: VolumeRenderer | None, rays: Rays, samples: Samples, backend: str | None):
     """What a step asks of a field, with the renderer where there is one, and the gradients."""
     field.zero_grad()
     with torch.no_grad():
@@ -82,7 +79,7 @@ def check_field(name: str, backend: str) -> dict[str, float]:
 
 def train(folder: Path, backend: str) -> list[float]:
     """The held-out PSNR of a small run, compiled and not."""
-    training.COMPILE_BACKEND = backend
+    build.COMPILE_BACKEND = training.COMPILE_BACKEND = backend
     options = [*MODELS["siren"], "model=siren", "model.depth=1", "budget.steps=30", "callbacks.snapshots=null"]
     options += ["device=cpu", "kernels=reference", "~logger"]
     return [training.train(compose_config([*options, f"compile={on}"], folder / on)) for on in ("true", "false")]
@@ -92,9 +89,6 @@ if __name__ == "__main__":
     warnings.filterwarnings("error", category=UserWarning)
     torch.manual_seed(0)
     set_kernels("reference")
-    backend, *names = sys.argv[1:]
-    folder = Path(names.pop()) if "--train" in names else None
-    found: dict[str, object] = {"fields": {name: check_field(name, backend) for name in names if name in FIELDS}}
-    if folder is not None:
-        found["trained"] = train(folder, backend)
-    print(json.dumps(found))
+    backend, folder, *names = sys.argv[1:]
+    fields = {name: check_field(name, backend) for name in names}
+    print(json.dumps({"fields": fields, "trained": train(Path(folder), backend)}))

@@ -5,15 +5,9 @@ from PIL.TiffImagePlugin import IFDRational
 
 
 def encode_exif(
-    orientation: int = 1,
-    make: str = "",
-    model: str = "",
-    focal: float | IFDRational = 0.0,
-    focal_35mm: int = 0,
-    seconds: float | IFDRational = 0.0,
-    aperture: float = 0.0,
-    speed: int = 0,
-) -> bytes:
+    orientation: int = 1, make: str = "", model: str = "", focal: float | IFDRational = 0.0, focal_35mm: int = 0,
+    seconds: float | IFDRational = 0.0, aperture: float = 0.0, speed: int = 0,
+) -> bytes:  # fmt: skip
     """EXIF, without the tags that are empty or 0; focal lengths in millimeters."""
     exif = Image.Exif()
     details = exif.get_ifd(0x8769)

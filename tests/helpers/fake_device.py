@@ -31,14 +31,8 @@ class FakeTensor(torch.Tensor):
     def __new__(cls, cpu_tensor: torch.Tensor) -> "FakeTensor":
         if cpu_tensor.dtype == torch.float64 and not cls.has_float64:
             raise TypeError("this device has no double precision")
-        made = torch.Tensor._make_wrapper_subclass(
-            cls,
-            cpu_tensor.size(),
-            strides=cpu_tensor.stride(),
-            storage_offset=0,
-            dtype=cpu_tensor.dtype,
-            device=f"{NAME}:0",
-        )
+        kind = {"strides": cpu_tensor.stride(), "storage_offset": 0, "dtype": cpu_tensor.dtype}
+        made = torch.Tensor._make_wrapper_subclass(cls, cpu_tensor.size(), device=f"{NAME}:0", **kind)
         made.cpu_tensor = cpu_tensor
         return made
 

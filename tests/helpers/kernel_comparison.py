@@ -29,18 +29,14 @@ def values_and_gradients(
 
 
 def assert_matches_reference(
-    call: Callable[..., object],
-    inputs: list[Tensor],
-    constants: tuple[int, ...] = (),
-    rtol: float = 1e-4,
-    atol: float = 1e-6,
-    same_with_any_threads: bool = True,
-) -> None:
+    call: Callable[..., object], inputs: list[Tensor], constants: tuple[int, ...] = (), rtol: float = 1e-4,
+    atol: float = 1e-6, same_with_any_threads: bool = True,
+) -> None:  # fmt: skip
     """The fast version gives what the reference gives, in each of its values and gradients, and twice the same bits.
 
     Args:
         atol: share of each tensor's largest value, or of one: single precision adds up in another order.
-        any_threads: whether the bits are also the same with another number of threads.
+        same_with_any_threads: whether the bits are also the same with another number of threads.
     """
     set_kernels("reference")
     expected = values_and_gradients(call, inputs, constants)

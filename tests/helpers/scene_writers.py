@@ -41,12 +41,7 @@ def convert_to_quaternion(w2c: np.ndarray) -> list[float]:
 
 
 def write_colmap(
-    folder: Path,
-    c2w: np.ndarray,
-    names: list[str],
-    cameras: dict[int, ColmapCamera],
-    text: bool = False,
-    points: np.ndarray | None = None,
+    folder: Path, c2w: np.ndarray, names: list[str], cameras: dict[int, ColmapCamera], text: bool = False, points=None
 ) -> None:
     """A sparse model; image i has camera i + 1, or the last there is."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -105,14 +100,8 @@ def write_scene(format: str, folder: Path, views: Views) -> Path:
     focal, (width, _) = float(views.cameras.K[0, 0, 0]), views.cameras.size(0)
     if format == "npz":
         images, c2w = views.images.numpy(), views.cameras.c2w.numpy()
-        np.savez(
-            folder / "s.npz",
-            images_train=images[3:],
-            c2ws_train=c2w[3:],
-            images_val=images[:3],
-            c2ws_val=c2w[:3],
-            focal=focal,
-        )
+        held_out = {"images_val": images[:3], "c2ws_val": c2w[:3]}
+        np.savez(folder / "s.npz", images_train=images[3:], c2ws_train=c2w[3:], focal=focal, **held_out)
         return folder / "s.npz"
     names = write_photos(folder / "images", views)
     if format in ("colmap", "text"):

@@ -14,9 +14,8 @@ from nerf_lightning.dataset.intrinsics import Intrinsics
 TAG_SIZE = 0.06
 LENS = Intrinsics(1024, 768, 900.0, 900.0, 520.0, 380.0, Distortion(k1=-0.2, k2=0.05))
 SMALL_LENS = Intrinsics(400, 300, 350.0, 350.0, 203.0, 148.0, Distortion(k1=-0.1, k2=0.02))
-SIX_TAGS = TagLayout(
-    "DICT_4X4_50", TAG_SIZE, {3 * r + c: flat_pose(0.09 * c, -0.09 * r) for r in (0, 1) for c in (0, 1, 2)}
-)
+TAG_POSES = {3 * r + c: flat_pose(0.09 * c, -0.09 * r) for r in (0, 1) for c in (0, 1, 2)}
+SIX_TAGS = TagLayout("DICT_4X4_50", TAG_SIZE, TAG_POSES)
 ONE_TAG = TagLayout("DICT_4X4_50", TAG_SIZE, {0: flat_pose(0.0, 0.0)})
 
 
@@ -35,22 +34,15 @@ def make_poses(count: int, seed: int = 0, tilt: float = 40.0, distance: float = 
     rng = np.random.default_rng(seed)
     out = []
     for _ in range(count):
-        polar_angle, azimuth = np.radians(tilt) * np.sqrt(rng.random()), 2 * np.pi * rng.random()
+        polar, azimuth = np.radians(tilt) * np.sqrt(rng.random()), 2 * np.pi * rng.random()
         target = np.array([0.09, -0.045, 0]) + 0.03 * rng.standard_normal(3) * [1, 1, 0]
-        way = np.array(
-            [np.sin(polar_angle) * np.cos(azimuth), np.sin(polar_angle) * np.sin(azimuth), np.cos(polar_angle)]
-        )
+        way = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
         out.append(make_pose(target + distance * (0.8 + 0.5 * rng.random()) * way, target, 0.5 * rng.standard_normal()))
     return np.stack(out)
 
 
 def make_observations(
-    layout: TagLayout,
-    c2w: np.ndarray,
-    lens: Intrinsics = LENS,
-    noise: float = 0.1,
-    seed: int = 0,
-    folder: Path = Path("x"),
+    layout: TagLayout, c2w: np.ndarray, lens: Intrinsics = LENS, noise: float = 0.1, seed: int = 0, folder=Path("x")
 ) -> list[PhotoObservation]:
     """What photos from these cameras show of a layout, without the tags that are not wholly in the frame."""
     rng, observations = np.random.default_rng(seed), []

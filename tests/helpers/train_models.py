@@ -21,34 +21,17 @@ SCENE = [
     *("dataset=bricks", "dataset.size=16", "dataset.train_views=12", "dataset.val_views=1", "dataset.rays=256"),
     *("dataset.samples=2048", "sampler.samples=32", "sampler.resolution=16", "callbacks.orbit=null"),
 ]
-PICTURE = [
-    *("+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.pictures=null"),
-]
+PICTURE = ["+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.pictures=null"]
+GROWING = ["model.base_resolution=8", "model.max_resolution=16", "model.growth_end=1"]
+HASHGRID = ["model.num_levels=3", "model.max_resolution=32", "model.log2_hashmap_size=10", "model.width=16"]
+REFINED = ["refine=both", "refine.focal=true", "refine.affine=true", "refine.vignetting=true"]
 MODELS = {
-    "hashgrid": [
-        *SCENE,
-        "refine=auto",
-        "model.num_levels=3",
-        "model.max_resolution=32",
-        "model.log2_hashmap_size=10",
-        "model.width=16",
-    ],
-    "voxels": [
-        *SCENE,
-        "recipe=voxels_small",
-        "model.base_resolution=8",
-        "model.max_resolution=16",
-        "model.growth_end=1",
-    ],
-    "tensorf": [
-        *(*SCENE, "refine=both", "refine.focal=true", "refine.affine=true", "refine.vignetting=true"),
-        *("recipe=tensorf_small", "model.base_resolution=8", "model.max_resolution=16", "model.growth_end=1"),
-    ],
+    "hashgrid": [*SCENE, "refine=auto", *HASHGRID],
+    "voxels": [*SCENE, "recipe=voxels_small", *GROWING],
+    "tensorf": [*SCENE, *REFINED, "recipe=tensorf_small", *GROWING],
     "mlp": [*SCENE, "recipe=mlp_small", "model.width=16"],
     "hashgrid2d": PICTURE,
-    "picture_mlp": [*PICTURE, "model.width=32"],
-    "fourier": [*PICTURE, "model.width=32"],
-    "siren": [*PICTURE, "model.width=32"],
+    **{name: [*PICTURE, "model.width=32"] for name in ("picture_mlp", "fourier", "siren")},
 }
 OTHER_SEED = "siren, another seed"
 NUM_STEPS = 14

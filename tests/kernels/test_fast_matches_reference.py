@@ -24,13 +24,8 @@ COUNTS = st.one_of(st.lists(st.integers(0, 7), max_size=6), st.just(BUNDLE))
 """Samples per ray."""
 UNBOUNDED = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]))
 HASH_GRIDS = [
-    ([(3, 3, 3)], [64]),
-    ([(2, 2, 2)], [32]),
-    ([(1500, 1500, 1500)], [2**14]),
-    ([(1, 4, 2), (5, 3, 8)], [30, 64]),
-    ([(n,) * 3 for n in (2, 4, 7, 12, 20)], [32] * 5),
-    ([(3, 2)], [12]),
-    ([(1, 2), (5, 3), (11, 20)], [6, 24, 64]),
+    *(([(3, 3, 3)], [64]), ([(2, 2, 2)], [32]), ([(1500, 1500, 1500)], [2**14]), ([(1, 4, 2), (5, 3, 8)], [30, 64])),
+    *(([(n,) * 3 for n in (2, 4, 7, 12, 20)], [32] * 5), ([(3, 2)], [12]), ([(1, 2), (5, 3), (11, 20)], [6, 24, 64])),
 ]
 """Cells and table sizes: dense, dense with unused entries, hashed beyond 32 bits, non-cubic, many levels, and 2D."""
 WIDTHS = [(4, 4), (3, 5), (16, 32, 16), (1, 1, 1), (5, 31, 3, 7), (12, 32, 32, 31, 3)]
@@ -129,13 +124,8 @@ def planes(draw: DRAW) -> Case:
     read = draw(st.sampled_from([k.plane_line_products, k.plane_line_sum]))
     factors = [torch.randn(3, side, side, channels), torch.randn(3, side, channels)]
     unit = 1.2 * torch.rand(3, draw(SAMPLES)) - 0.1
-    return Case(
-        lambda p, lines, u: read(p, lines, u.T),
-        [*factors, unit],
-        draw(st.sampled_from([(), (2,)])),
-        atol=3e-6,
-        spoilt=2,
-    )
+    constants = draw(st.sampled_from([(), (2,)]))
+    return Case(lambda p, lines, u: read(p, lines, u.T), [*factors, unit], constants, atol=3e-6, spoilt=2)
 
 
 def ray_positions(draw: DRAW) -> Case:

@@ -60,17 +60,15 @@ def test_march_along_walls_matches_reference(distance: float):
     for lean in (0.0, 1e-7, 1e-6, 1e-5, 1e-3, 0.3):
         generator = torch.Generator().manual_seed(1)
         sideways = lean * (2 * torch.rand(500, generator=generator) - 1)
-        direction = normalize(
-            torch.stack([torch.ones(500), sideways, 0.1 * torch.rand(500, generator=generator)], 1), dim=1
-        )
+        rising = 0.1 * torch.rand(500, generator=generator)
+        direction = normalize(torch.stack([torch.ones(500), sideways, rising], 1), dim=1)
         at = torch.stack([torch.zeros(500), 1e-6 * torch.randn(500, generator=generator), torch.zeros(500)], 1)
         rays, results = Rays(at - distance * direction, direction), []
         for version in ("reference", "auto"):
             set_kernels(version)
             step = 2 * 3**0.5 / 4000
-            results.append(
-                Samples(*march(rays, CUBE, *CUBE.near_far(rays), torch.zeros(500), grid.flatten(), 4000, step))
-            )
+            found = march(rays, CUBE, *CUBE.near_far(rays), torch.zeros(500), grid.flatten(), 4000, step)
+            results.append(Samples(*found))
         assert torch.equal(results[0].t, results[1].t) and torch.equal(results[0].offsets, results[1].offsets)
         total += len(results[0])
     assert total > 1e5

@@ -12,9 +12,7 @@ BOX = torch.tensor([[-1.0, -0.5, 0.2], [1.5, 2.0, 1.0]])
 
 
 def mlp(bounds: Bounds) -> Field:
-    return MLPField(
-        bounds, depth=3, width=16, skip=2, position_frequencies=3, direction_frequencies=2, density="softplus"
-    )
+    return MLPField(bounds, 3, 16, skip=2, position_frequencies=3, direction_frequencies=2, density="softplus")
 
 
 def hashgrid(bounds: Bounds) -> Field:

@@ -19,14 +19,8 @@ BOX = torch.tensor([[-1.0, -0.5, -1.0], [1.0, 0.5, 1.0]])
 
 
 def hashgrid(bounds: Bounds, base_resolution: int, max_resolution: int, size: str) -> list[int]:
-    field = HashGridField(
-        bounds,
-        num_levels=3,
-        log2_hashmap_size=8,
-        base_resolution=base_resolution,
-        max_resolution=max_resolution,
-        size=size,
-    )
+    given = {"base_resolution": base_resolution, "max_resolution": max_resolution, "size": size}
+    field = HashGridField(bounds, num_levels=3, log2_hashmap_size=8, **given)
     return [side for side, *_ in field.grid.cells]
 
 
@@ -58,9 +52,7 @@ def test_grid_auto_size_has_two_cells_a_pixel_at_most(resolutions: Resolutions):
     assert auto[0] == fixed[0] == 16 and auto[-1] == 40 and fixed[-1] == 100
     assert resolutions(bounds, 16, 30, "auto") == resolutions(bounds, 16, 30, "fixed")
     assert resolutions(Bounds(BOX), 16, 100, "auto") == fixed, "no limit without photos"
-    assert set(resolutions(Bounds(BOX, pixel_footprint=0.5), 16, 100, "auto")) == {8}, (
-        "few pixels limit the base resolution too"
-    )
+    assert set(resolutions(Bounds(BOX, pixel_footprint=0.5), 16, 100, "auto")) == {8}, "as few pixels do"
 
 
 @pytest.mark.parametrize(
@@ -86,11 +78,8 @@ def test_run_on_large_photos_has_finer_field(tmp_path: Path, monkeypatch: pytest
     args += ["model.size=fixed", "model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "~logger"]
     scales: list[float] = []
     monkeypatch.setattr(RayDataModule, "adapt_num_rays", lambda data, drawn: scales.append(data._resolution_scale))
-    train(
-        compose_config(
-            [*args, "callbacks.orbit=null", "callbacks.snapshots.steps=[]", "budget.steps=7"], tmp_path / "run"
-        )
-    )
+    args += ["callbacks.orbit=null", "callbacks.snapshots.steps=[]", "budget.steps=7"]
+    train(compose_config(args, tmp_path / "run"))
     system = load_run(tmp_path / "run").system
     scale = system.field.resolution_scale
     assert scales == [1.0] * 4 + [scale] * 3, "the target number of samples follows the field's resolution"

@@ -81,9 +81,7 @@ def test_fourier_field_cycles_are_of_longer_side():
     size = (32, 64)
     field, uv = FourierField(size, num_frequencies=5, width=8), torch.rand(20, 2)
     lengths = (uv - 0.5) * torch.tensor(size) / 64
-    angles = torch.tensor(
-        [[2 * math.pi * float(place @ field.cycles[:, k]) for k in range(5)] for place in lengths.unbind()]
-    )
+    angles = torch.tensor([[2 * math.pi * float(at @ field.cycles[:, k]) for k in range(5)] for at in lengths.unbind()])
     expected = torch.sigmoid(field.net(torch.cat([angles.sin(), angles.cos()], dim=1)))
     torch.testing.assert_close(field(uv), expected, atol=1e-4, rtol=0)
 

@@ -7,14 +7,8 @@ from nerf_lightning.model import TensoRFField
 from tests.helpers.growth import grow
 
 BOX = Bounds(torch.tensor([[-2.0, -1, 0], [2, 3, 5]]))
-SMALL = {
-    "density_components": 3,
-    "color_components": 8,
-    "base_resolution": 4,
-    "max_resolution": 16,
-    "stages": 3,
-    "growth_end": 0.5,
-}
+SMALL = {"density_components": 3, "color_components": 8, "base_resolution": 4, "max_resolution": 16}
+SMALL |= {"stages": 3, "growth_end": 0.5}
 
 
 def field(**options) -> TensoRFField:

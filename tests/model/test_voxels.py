@@ -70,9 +70,8 @@ def test_voxels_upsample_drops_unread_vertices():
     far = BOX.to_world(0.8 + 0.2 * torch.rand(50, 3))
     assert (voxels.density(far) < 1e-3).all()
     assert voxels.index.min() == 0 and voxels.index.max() == len(voxels.log_density) - 1
-    assert torch.equal(
-        voxels.index[voxels.vertex_of_row[1:].long()], torch.arange(1, len(voxels.vertex_of_row), dtype=torch.int32)
-    )
+    rows = torch.arange(1, len(voxels.vertex_of_row), dtype=torch.int32)
+    assert torch.equal(voxels.index[voxels.vertex_of_row[1:].long()], rows)
 
 
 @pytest.mark.parametrize("grown", [False, True])

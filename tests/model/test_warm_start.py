@@ -78,12 +78,7 @@ def test_warm_start_larger_field_is_same_function_and_learns(make: Callable[...,
 
 def hashgrid2d(num_levels: int = 2, max_resolution: int = 8, width: int = 8) -> PictureField:
     field = HashGrid2DField(
-        (32, 24),
-        num_levels=num_levels,
-        log2_hashmap_size=10,
-        base_resolution=4,
-        max_resolution=max_resolution,
-        width=width,
+        (32, 24), num_levels, log2_hashmap_size=10, base_resolution=4, max_resolution=max_resolution, width=width
     )
     torch.nn.init.normal_(field.grid.tables)
     return field

@@ -137,9 +137,8 @@ def test_init_from_exif_only_if_exposures_explain_photos(views: Views):
     exposures = [2.0**view for view in range(VIEWS)]
     gains = torch.tensor(exposures).log() / GAMMA
     gains = (gains - gains.mean())[:, None].expand(VIEWS, 3)
-    exposed = Views.from_images(
-        (views.images * gains.exp()[:, :1, None, None] / 4).clamp(0, 255).to(torch.uint8), views.cameras
-    )
+    images = (views.images * gains.exp()[:, :1, None, None] / 4).clamp(0, 255).to(torch.uint8)
+    exposed = Views.from_images(images, views.cameras)
     for photos, brightness, fits in ((exposed, 0.25, True), (views, 1.0, False)):
 
         def darker(rays: Rays, background: Tensor, brightness: float = brightness) -> RenderOutput:
@@ -150,9 +149,8 @@ def test_init_from_exif_only_if_exposures_explain_photos(views: Views):
         assert (found["exif"] > 0.5) == fits
         corrections.record_trial(START_PROGRESS, ["exposure"], {"exposure": 1.0}, found["exif"] > 0)
         torch.testing.assert_close(corrections.color.log_gains.data, gains * fits)
-    assert torch.equal(
-        Corrections(views.cameras, BOX, exposures=exposures).color.log_gains.data, corrections.color.exif_log_gains
-    )
+    started = Corrections(views.cameras, BOX, exposures=exposures).color
+    assert torch.equal(started.log_gains.data, corrections.color.exif_log_gains)
     assert not Corrections(views.cameras, BOX, exposures=exposures, exposure=False).color.log_gains.any()
 
 

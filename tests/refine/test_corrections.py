@@ -80,12 +80,9 @@ def test_color_correction_gains_keep_background(cameras: Cameras):
     torch.nn.init.normal_(corrections.color.log_gains)
     background, opacity = torch.rand(VIEWS, 3), torch.tensor([0, 0.5, 1, 1, 1])
     red, given = torch.tensor([0.5, 0, 0]).expand(VIEWS, 3), cameras.generate_rays(views, views, views)
-    found = corrections.color(
-        opacity[:, None] * red + (1 - opacity)[:, None] * background, opacity, background, given, views
-    )
-    torch.testing.assert_close(
-        found, opacity[:, None] * red * corrections.color.gains + (1 - opacity)[:, None] * background
-    )
+    red, behind = opacity[:, None] * red, (1 - opacity)[:, None] * background
+    found = corrections.color(red + behind, opacity, background, given, views)
+    torch.testing.assert_close(found, red * corrections.color.gains + behind)
 
 
 def fit_corrections(corrections: Corrections, truth: Corrections, cameras: Cameras) -> None:
@@ -153,18 +150,14 @@ def test_compute_vignetting_darkens_corners_only():
 
 
 FIELDS = {
-    "hashgrid": lambda: HashGridField(
-        BOX, num_levels=3, log2_hashmap_size=8, base_resolution=4, max_resolution=16, width=16
-    ),
+    "hashgrid": lambda: HashGridField(BOX, 3, log2_hashmap_size=8, base_resolution=4, max_resolution=16, width=16),
     "tensorf": lambda: TensoRFField(BOX, 8, 8, base_resolution=6, max_resolution=6, stages=1, width=16),
     "voxels": lambda: VoxelField(BOX, base_resolution=6, max_resolution=6, stages=1),
     "mlp": lambda: MLPField(BOX, width=16),
 }
 
 
-def loss(
-    field: Field, corrections: Corrections, rays: Rays, views: Tensor, samples: Samples, direction: Tensor
-) -> Tensor:
+def loss(field: Field, corrections: Corrections, rays: Rays, views: Tensor, samples: Samples, direction) -> Tensor:
     """Sum over the rendered samples, with directions that do not follow the cameras."""
     seen = VolumeRenderer("black").to(direction.device, direction.dtype)(
         corrections.poses(rays, views), samples, lambda x, _: field(x, samples.directions(rays))
@@ -215,9 +208,8 @@ def test_train_with_corrections_reports_and_exports_poses(tmp_path: Path, capsys
     assert found["focal_factor"] is None and found["corner_brightness"] is None
     assert max(found["turned_degrees"]) > 0 and min(found["exposure"]) < 1 < max(found["exposure"])
     assert nl.load_run(tmp_path, "cpu").system.corrections is None
-    again = [
-        reload_data(load_config(tmp_path), read_scene_file(tmp_path), corrected=which).scene for which in (True, False)
-    ]
+    files = load_config(tmp_path), read_scene_file(tmp_path)
+    again = [reload_data(*files, corrected=which).scene for which in (True, False)]
     moved, given = ([poses.train.cameras.centers for poses in again][i] for i in (0, 1))
     torch.testing.assert_close((moved - given).norm(dim=1), torch.tensor(found["moved"]), atol=2e-5, rtol=0)
     assert found["moved"][0] > 0 and torch.equal(again[0].val.cameras.c2w, again[1].val.cameras.c2w)

@@ -33,9 +33,8 @@ def test_projection_jacobian_matches_finite_differences():
     back = torch.linalg.matrix_exp(cross(-pose_adjustment[:, :3]))
     after = (places - centers[:, None] - pose_adjustment[:, None, 3:]) @ back.mT
     expected = 90 * (torch.nn.functional.normalize(after, dim=2) - torch.nn.functional.normalize(before, dim=2))
-    found = (compute_projection_jacobian(centers, focals.double(), places) @ pose_adjustment[:, None, :, None]).squeeze(
-        3
-    )
+    jacobian = compute_projection_jacobian(centers, focals.double(), places)
+    found = (jacobian @ pose_adjustment[:, None, :, None]).squeeze(3)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-9)
 
 

@@ -86,9 +86,8 @@ def test_read_path_converts_frame(tmp_path: Path, capsys: pytest.CaptureFixture)
         torch.testing.assert_close(read.c2w, path.c2w, atol=1e-4, rtol=0)
         torch.testing.assert_close(read.K, path.K, atol=1e-3, rtol=0)
         assert (read.width, read.height) == (16, 12)
-        assert (
-            "in the world frame of the photos' own file (--path-frame run takes the other)" in capsys.readouterr().out
-        )
+        out = capsys.readouterr().out
+        assert "in the world frame of the photos' own file (--path-frame run takes the other)" in out
         read = build_path(str(file), None, path, None, to_source, "run").cameras
         torch.testing.assert_close(read.c2w, in_file, atol=1e-4, rtol=0)
         assert "in the run's frame" in capsys.readouterr().out

@@ -51,9 +51,7 @@ def test_render_test_path_shows_photos_and_renders(run: Path, tmp_path: Path):
     assert np.abs(frame[5:160:10, 5:160:10] / 255 - truth).max() < 1 / 255
 
 
-def test_render_compact_file_and_the_same_command_reuses_frames(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-):
+def test_render_compact_file_again_reuses_frames(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     compact, frames = export_compact(run, max_psnr_drop=9), tmp_path / "frames"
     for there in ("cpu", "2 of them reused"):
         render(compact, frames=2, background="transparent", output=frames)

@@ -65,9 +65,7 @@ def test_reload_data_built_in_scene_is_not_replaced_by_download(tmp_path: Path):
     run = a_run(tmp_path / "run", f"dataset.folder={tmp_path}")
     assert again(run).name == "bricks", "and the network is not asked"
     save_npz(bricks(size=16, train_views=4, val_views=2), tmp_path / "published.npz")
-    with pytest.raises(
-        InputError, match="found the scene 'published', expected 'bricks', which the run was trained on"
-    ):
+    with pytest.raises(InputError, match="found the scene 'published', expected 'bricks', which the run was trained"):
         again(run)
     assert again(run, str(tmp_path / "published.npz")).name == "published"
 

@@ -70,12 +70,10 @@ def ball(radius: float, density: float):
     return lambda x: density * (x.norm(dim=-1) < radius).float()
 
 
-@pytest.mark.parametrize(
-    ("radius", "unbounded", "training"), [(0.0, False, True), (0.4, False, False), (0.4, True, True)]
-)
-def test_importance_sampler_coarse_and_fine_tile_ray(radius, unbounded, training, box: Bounds, rays: Rays):
+@pytest.mark.parametrize(("radius", "unbounded", "train"), [(0.0, False, True), (0.4, False, False), (0.4, True, True)])
+def test_importance_sampler_coarse_and_fine_tile_ray(radius, unbounded, train, box: Bounds, rays: Rays):
     bounds = replace(box, unbounded=unbounded)
-    chance = Generator().manual_seed(1) if training else None
+    chance = Generator().manual_seed(1) if train else None
     samples = ImportanceSampler(bounds, 12, 20)(rays, ball(radius, 5.0), chance)
     start, end = (samples.t - samples.dt / 2), (samples.t + samples.dt / 2)
     near, far = bounds.near_far(rays)

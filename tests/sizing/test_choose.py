@@ -19,11 +19,9 @@ def rungs(*psnrs: float) -> list[RungResult]:
     return [RungResult(psnr, 1000 * 2**index) for index, psnr in enumerate(psnrs)]
 
 
-@pytest.mark.parametrize(
-    ("gain", "times", "stops"), [(0.2, 2, False), (0.05, 2, True), (0.2, 8, True), (0.2, 0.5, False)]
-)
-def test_is_growth_finished_weighs_gain_against_bytes(gain: float, times: float, stops: bool):
-    after = RungResult(20 + gain, int(1000 * times))
+@pytest.mark.parametrize(("gain", "by", "stops"), [(0.2, 2, False), (0.05, 2, True), (0.2, 8, True), (0.2, 0.5, False)])
+def test_is_growth_finished_weighs_gain_against_bytes(gain: float, by: float, stops: bool):
+    after = RungResult(20 + gain, int(1000 * by))
     assert is_growth_finished([RungResult(20, 1000), after, after], NEAR) is stops
 
 

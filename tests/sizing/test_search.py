@@ -22,17 +22,11 @@ from nerf_lightning.sizing.choose import Target, read_ladder
 from nerf_lightning.synthetic.objects import PILE, make_object_scene
 from tests.helpers.growth import grow
 
+COMPONENTS = {"density_components": 3, "color_components": 3}
 RUNGS = [
-    {
-        "density_components": 3,
-        "color_components": 3,
-        "base_resolution": 4,
-        "max_resolution": 4,
-        "width": 8,
-        "stages": 1,
-    },
-    {"density_components": 8, "color_components": 8, "base_resolution": 8, "max_resolution": 16, "width": 16},
-    {"density_components": 8, "color_components": 8, "base_resolution": 8, "max_resolution": 24, "width": 16},
+    {**COMPONENTS, "base_resolution": 4, "max_resolution": 4, "width": 8, "stages": 1},
+    {**dict.fromkeys(COMPONENTS, 8), "base_resolution": 8, "max_resolution": 16, "width": 16},
+    {**dict.fromkeys(COMPONENTS, 8), "base_resolution": 8, "max_resolution": 24, "width": 16},
 ]
 SAMPLERS = [{"samples": 32, "resolution": 8}, {"samples": 64, "resolution": 16}]
 FAST = ["threads=1", "device=cpu", "callbacks.snapshots.steps=[]", "budget.steps=60"]
@@ -70,15 +64,15 @@ def test_rightsize_writes_smallest_run_and_experiment(scene: str, tmp_path: Path
         search_small(scene, psnr=15.0)
 
 
-def test_rightsize_interrupted_keeps_what_was_trained_in_full(
-    scene: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_rightsize_interrupted_keeps_full_trainings(scene: str, tmp_path: Path, monkeypatch):
+    few = ["budget.steps=8", "sampler.resolution=16"]
+    (tmp_path / "ladder.yaml").write_text(yaml.safe_dump({"rungs": RUNGS[:2], "samplers": SAMPLERS[:1]}))
     with monkeypatch.context() as patched:
         patched.setattr(search, "compress_system", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
         with pytest.raises(KeyboardInterrupt):
-            search_small(scene, ["budget.steps=8"], psnr=90.0)
+            search_small(scene, few, psnr=90.0)
     monkeypatch.setattr(search, "train", lambda *_: pytest.fail("trained again"))
-    found = search_small(scene, ["budget.steps=8"], psnr=90.0)
+    found = search_small(scene, few, psnr=90.0)
     assert not found["reached"] and (tmp_path / "found" / "rightsize.json").exists()
 
 

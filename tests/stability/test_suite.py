@@ -39,9 +39,8 @@ def test_make_waves_holds_all_frequencies_down_to_six_pixels_of_training():
 
 
 def test_list_trials_unsolvable_conditions_have_one_seed():
-    trials = list_trials(
-        ["clean", "OpenGL poses", "tiny hash table", "2D: clean"], ["hashgrid", "mlp", "2D mlp"], 2, 10
-    )
+    names = ["clean", "OpenGL poses", "tiny hash table", "2D: clean"]
+    trials = list_trials(names, ["hashgrid", "mlp", "2D mlp"], 2, 10)
     assert [(one.condition, one.method, one.seed) for one in trials] == [
         ("clean", "hashgrid", 0), ("clean", "hashgrid", 1), ("clean", "mlp", 0), ("clean", "mlp", 1),
         ("OpenGL poses", "hashgrid", 0), ("OpenGL poses", "mlp", 0),
@@ -50,9 +49,7 @@ def test_list_trials_unsolvable_conditions_have_one_seed():
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "method", [name for name, one in METHODS.items() if one.recovery_twin is None and name != "relu mlp"]
-)
+@pytest.mark.parametrize("method", [n for n, m in METHODS.items() if m.recovery_twin is None and n != "relu mlp"])
 def test_run_trial_every_method_learns_something(method: str, tmp_path: Path):
     result = run_trial(Trial("2D: clean" if METHODS[method].is_2d else "black, small object", method, 0, 30), tmp_path)
     assert result.status == "finished", result

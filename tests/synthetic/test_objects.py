@@ -66,9 +66,8 @@ def test_corruptions_of_poses_and_bounds_have_their_size():
     scene = make_object_scene(PILE, size=8)
     original = scene.train.cameras.c2w.clone()
     flipped = corruptions.flip_axes(scene, 0).train.cameras.c2w
-    assert torch.equal(flipped[:, :3, 1:3], -original[:, :3, 1:3]) and torch.equal(
-        flipped[:, :3, 3], original[:, :3, 3]
-    )
+    assert torch.equal(flipped[:, :3, 1:3], -original[:, :3, 1:3])
+    assert torch.equal(flipped[:, :3, 3], original[:, :3, 3])
     big = corruptions.scale_world(scene, 0, 10.0)
     assert torch.equal(big.train.cameras.centers, 10 * original[:, :3, 3])
     turned = corruptions.add_pose_noise(scene, 0, 5.0).train.cameras.c2w[:, :3, :3]

@@ -18,27 +18,15 @@ from nerf_lightning.utils.libraries import silence_lightning
 
 STEPS = 24
 OPTIONS = ("+experiment=smoke_3d", "dataset.size=16", "dataset.train_views=6", f"budget.steps={STEPS}", "device=cpu")
-OFF = (
-    "callbacks.validation=null",
-    "callbacks.snapshots=null",
-    "callbacks.orbit=null",
-    "callbacks.recovery=null",
-    "~logger",
-)
+OFF = (*(f"callbacks.{name}=null" for name in ("validation", "snapshots", "orbit", "recovery")), "~logger")
 
 
 def make_bare_trainer(steps: int) -> L.Trainer:
     silence_lightning()
     return L.Trainer(
-        max_steps=steps,
-        max_epochs=-1,
-        accelerator="cpu",
-        limit_val_batches=0,
-        logger=False,
-        enable_checkpointing=False,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-    )
+        max_steps=steps, max_epochs=-1, accelerator="cpu", limit_val_batches=0, logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+    )  # fmt: skip
 
 
 def test_bare_trainer_same_steps_gives_same_weights(tmp_path: Path):
@@ -66,17 +54,9 @@ def test_bare_trainer_view_loss_of_unbounded_scene_measures_texture(unbounded: b
     assert (data.draw(0).texturelessness is not None) == unbounded
 
 
-PROPOSALS = (
-    "refine=poses",
-    "sampler=proposal",
-    "~sampler.resolution",
-    "sampler.lr_final_factor=0.01",
-    "optimizer.lr=0.02",
-)
-
-
 def test_param_groups_proposals_and_corrections_have_own_learning_rates(tmp_path: Path):
-    cfg = compose_config([*OPTIONS, *PROPOSALS, "schedule=constant"], tmp_path)
+    proposals = "sampler=proposal", "~sampler.resolution", "sampler.lr_final_factor=0.01"
+    cfg = compose_config([*OPTIONS, *proposals, "refine=poses", "optimizer.lr=0.02", "schedule=constant"], tmp_path)
     data = build_data(cfg)
     system, trainer = build_system(cfg, get_metadata(data), CPU), make_bare_trainer(2)
     trainer.fit(system, data)

@@ -55,9 +55,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory, isolated_cache: None) 
     return folder
 
 
-def at_step(
-    monkeypatch: pytest.MonkeyPatch, kind: type, hook: str, action: Callable[[], None], step: int = STOP
-) -> None:
+def at_step(monkeypatch, kind: type, hook: str, action: Callable[[], None], step=STOP) -> None:
     """Runs an action once, at the start of a callback's hook after some steps."""
     before, done = getattr(kind, hook), []
 

@@ -10,7 +10,8 @@ from nerf_lightning.synthetic.bricks import bricks
 
 SMALL = (
     *("dataset.rays=64", "dataset.samples=null", "budget.steps=2", "callbacks.throughput=null"),
-    *("callbacks.orbit=null", "callbacks.snapshots=null", "logger=null", "model.num_levels=2", "hydra.run.dir=run"),
+    *("callbacks.orbit=null", "callbacks.snapshots=null", "logger=null", "model.num_levels=2"),
+    *("sampler.resolution=16", "hydra.run.dir=run"),
 )
 
 

@@ -91,9 +91,8 @@ def test_build_system_chunk_follows_device_limits(tmp_path: Path):
     system = build_system(cfg, get_metadata(data), torch.device("cuda"))
     assert system.chunk == system.sampler.chunk == 524288
     assert build_system(compose_config(["sampler=uniform"], tmp_path), get_metadata(data)).chunk_rays == 4096
-    flat = build_system(
-        compose_config(["+experiment=smoke_2d", "limits.chunk_samples=5"], tmp_path), ImageMetadata(8, 8)
-    )
+    cfg = compose_config(["+experiment=smoke_2d", "limits.chunk_samples=5"], tmp_path)
+    flat = build_system(cfg, ImageMetadata(8, 8))
     assert isinstance(flat, NeRF2D) and flat.chunk == 5
 
 

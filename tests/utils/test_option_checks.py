@@ -11,12 +11,9 @@ from nerf_lightning.utils.option_checks import Ge, Gt, Le, Lt, check_options
 
 
 def target(
-    seconds: float | None = None,
-    steps: int = 1,
-    color: str | list[float] = "scene",
-    share: Annotated[float, Ge(0), Le(1)] = 0.5,
-    decay: Annotated[float, Gt(0), Lt(1)] = 0.5,
-) -> None:
+    seconds: float | None = None, steps: int = 1, color: str | list[float] = "scene",
+    share: Annotated[float, Ge(0), Le(1)] = 0.5, decay: Annotated[float, Gt(0), Lt(1)] = 0.5,
+) -> None:  # fmt: skip
     """Takes options of the usual kinds."""
 
 

@@ -16,9 +16,8 @@ from nerf_lightning.utils import memory
 from nerf_lightning.utils.parsing import MAX_YAML_BYTES, read_json, read_npy, read_npz, read_yaml
 
 ROWS = np.arange(6.0).reshape(2, 3)
-ALIASES = "a: &a [1, 1, 1, 1, 1]\n" + "".join(
-    f"{b}: &{b} [*{a}, *{a}, *{a}]\n" for a, b in zip("abcd", "bcde", strict=True)
-)
+PAIRS = ("ab", "bc", "cd", "de")
+ALIASES = "a: &a [1, 1, 1, 1, 1]\n" + "".join(f"{b}: &{b} [*{a}, *{a}, *{a}]\n" for a, b in PAIRS)
 
 
 @pytest.mark.parametrize(

@@ -74,16 +74,9 @@ class Browser(viser.ClientHandle):
         self.client_id = 7
         c2w = make_request().c2w
         self.pictures: list[np.ndarray] = []
-        self.camera = SimpleNamespace(
-            wxyz=SO3.from_matrix(c2w[:3, :3]).wxyz,
-            position=c2w[:3, 3],
-            fov=0.8,
-            aspect=1.5,
-            on_update=lambda call: None,
-        )
-        self.scene = SimpleNamespace(
-            set_background_image=lambda image, format, jpeg_quality: self.pictures.append(image)
-        )
+        pose = {"wxyz": SO3.from_matrix(c2w[:3, :3]).wxyz, "position": c2w[:3, 3]}
+        self.camera = SimpleNamespace(**pose, fov=0.8, aspect=1.5, on_update=lambda call: None)
+        self.scene = SimpleNamespace(set_background_image=lambda image, **_: self.pictures.append(image))
 
 
 @pytest.fixture
@@ -140,12 +133,8 @@ def test_live_shows_progress_and_does_not_change_training(tmp_path: Path, monkey
 
     monkeypatch.setattr(FieldPage, "__init__", welcome)
     monkeypatch.setattr(FieldPage, "show_progress", with_browser)
-    train(
-        compose_config(
-            [*SMALL, "callbacks=live", "callbacks.live.port=0", "callbacks.live.max_time_fraction=0.9"],
-            tmp_path / "live",
-        )
-    )
+    given = [*SMALL, "callbacks=live", "callbacks.live.port=0", "callbacks.live.max_time_fraction=0.9"]
+    train(compose_config(given, tmp_path / "live"))
     assert browser.pictures
     assert 0 < reports[0][0] < 1 and reports[0][1].startswith("step ")
     assert reports[-1][0] == 1 and "training is done: held out" in reports[-1][1]

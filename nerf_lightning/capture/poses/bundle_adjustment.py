@@ -71,9 +71,7 @@ def lens_to_vector(lens: Intrinsics) -> Float[np.ndarray, "9"]:
 def vector_to_lens(lens: Intrinsics, vector: Float[np.ndarray, "9"]) -> Intrinsics:
     """Inverse of `lens_to_vector`; the image size is that of `lens`."""
     focal, aspect, cx, cy, k1, k2, p1, p2, k3 = vector.tolist()
-    return replace(
-        lens, fx=focal, fy=focal * aspect, cx=cx, cy=cy, distortion=Distortion(k1=k1, k2=k2, p1=p1, p2=p2, k3=k3)
-    )
+    return replace(lens, fx=focal, fy=focal * aspect, cx=cx, cy=cy, distortion=Distortion(k1, k2, k3, p1=p1, p2=p2))
 
 
 def simplify_lens(lens: Intrinsics, free: tuple[str, ...]) -> Intrinsics:
@@ -147,21 +145,13 @@ class BundleProblem:
         self.free[:9] = [name in free_lens for name in LENS_PARAMETERS]
         self.free[first_tag:first_twist] = np.repeat([tag not in fixed_tags for tag in range(len(bundle.tags))], 6)
         self.free[first_twist:] = free_twists
-        detections = [
-            (photo, tag, detection)
-            for photo, by_tag in enumerate(bundle.detections)
-            for tag, detection in by_tag.items()
-        ]
+        by_photo = enumerate(bundle.detections)
+        detections = [(photo, tag, corners) for photo, tags in by_photo for tag, corners in tags.items()]
         counts = [len(detection.pixels) for _, _, detection in detections]
         photo, tag = (np.repeat([entry[i] for entry in detections], counts) for i in (0, 1))
-        self.columns = np.column_stack(
-            [
-                np.tile(np.arange(9), (len(photo), 1)),
-                9 + 6 * photo[:, None] + np.arange(6),
-                first_tag + 6 * tag[:, None] + np.arange(6),
-                first_twist + tag,
-            ]
-        )
+        lens_columns = np.tile(np.arange(9), (len(photo), 1))
+        photo_columns, tag_columns = 9 + 6 * photo[:, None] + np.arange(6), first_tag + 6 * tag[:, None] + np.arange(6)
+        self.columns = np.column_stack([lens_columns, photo_columns, tag_columns, first_twist + tag])
         """Indices [N, 22] of the parameters that each point depends on."""
         self.pixels = np.concatenate([detection.pixels for _, _, detection in detections])
         self.points = np.concatenate([detection.points for _, _, detection in detections])

@@ -105,9 +105,7 @@ def calibrate(folder: Path, observations: Sequence[PhotoObservation], layout: di
         observations, exclusions, lambda left: _fit_lens_model(initial_lens, left, layout), MIN_PHOTOS
     )
     lens, refined = solution.lens, solution.refined
-    corners = [
-        detection.pixels for photo in photos if not photo.reason for detection in photo.observation.detections.values()
-    ]
+    corners = [tag.pixels for photo in photos if not photo.reason for tag in photo.observation.detections.values()]
     hull = cv2.convexHull(np.concatenate(corners).astype(np.float32))
     coverage = float(cv2.contourArea(hull)) / (lens.width * lens.height)
     uncertainty = refined.deviations.get("focal", 0.0) / lens.fx

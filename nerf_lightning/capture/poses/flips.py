@@ -38,10 +38,8 @@ def resolve_flips(hypotheses: Sequence[Sequence[Hypothesis]], points: Sequence[F
     # Each photo's pose takes six degrees of freedom; the remaining residuals are noise.
     degrees_of_freedom = sum(max(2 * len(visible_points) - 6, 1) for visible_points in points)
     variance = max(sum(options[0].sum_of_squares for options in hypotheses) / degrees_of_freedom, 1e-4)
-    likelihoods = [
-        np.exp([(options[0].sum_of_squares - h.sum_of_squares) / (2 * variance) for h in options])
-        for options in hypotheses
-    ]
+    squares = [np.array([h.sum_of_squares for h in options]) for options in hypotheses]
+    likelihoods = [np.exp((x[0] - x) / (2 * variance)) for x in squares]
     center = np.median([visible_points.mean(0) for visible_points in points], axis=0)
     offsets = [np.stack([invert_pose(h.pose)[:3, 3] - center for h in options]) for options in hypotheses]
     directions = [each / np.linalg.norm(each, axis=1, keepdims=True) for each in offsets]

@@ -47,24 +47,19 @@ def refine_pose(
     lens: Intrinsics, pose: Pose, points: Float[np.ndarray, "M 3"], pixels: Float[np.ndarray, "M 2"]
 ) -> Hypothesis:
     """Refines a pose by Levenberg-Marquardt on the reprojection error."""
-    rotation, translation = cv2.solvePnPRefineLM(
-        points, pixels, lens.K, lens.opencv_distortion, cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
-    )
+    start = cv2.Rodrigues(pose[:3, :3])[0], pose[:3, 3:].copy()
+    rotation, translation = cv2.solvePnPRefineLM(points, pixels, lens.K, lens.opencv_distortion, *start)
     refined = rotvec_to_matrix(rotation.reshape(3), translation.reshape(3))
-    return min(
-        evaluate_pose(lens, refined, points, pixels),
-        evaluate_pose(lens, pose, points, pixels),
-        key=lambda h: h.sum_of_squares,
-    )
+    candidates = [evaluate_pose(lens, candidate, points, pixels) for candidate in (refined, pose)]
+    return min(candidates, key=lambda h: h.sum_of_squares)
 
 
 def deduplicate(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """The best distinct hypotheses, best first."""
     unique: list[Hypothesis] = []
     for candidate in sorted(hypotheses, key=lambda h: h.sum_of_squares):
-        if np.isfinite(candidate.sum_of_squares) and all(
-            angle_between(candidate.pose, kept.pose) > MIN_POSE_DIFFERENCE_RAD for kept in unique
-        ):
+        is_new = all(angle_between(candidate.pose, kept.pose) > MIN_POSE_DIFFERENCE_RAD for kept in unique)
+        if is_new and np.isfinite(candidate.sum_of_squares):
             unique.append(candidate)
     return unique[:MAX_HYPOTHESES]
 
@@ -75,12 +70,10 @@ def estimate_tag_poses(lens: Intrinsics, detection: TagDetection) -> list[Hypoth
     A planar target seen from afar has two poses (Collins and Bartoli 2014, "Infinitesimal plane-based pose estimation")
     that its reprojection error often cannot distinguish.
     """
-    distortion = lens.opencv_distortion
-    ok, turns, shifts, _ = cv2.solvePnPGeneric(
-        detection.points, detection.pixels, lens.K, distortion, flags=cv2.SOLVEPNP_IPPE
-    )
+    points, pixels, flags = detection.points, detection.pixels, cv2.SOLVEPNP_IPPE
+    ok, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, lens.K, lens.opencv_distortion, flags=flags)
     poses = [rotvec_to_matrix(r.reshape(3), t.reshape(3)) for r, t in zip(turns, shifts, strict=True)] if ok else []
-    return deduplicate([refine_pose(lens, pose, detection.points, detection.pixels) for pose in poses])
+    return deduplicate([refine_pose(lens, pose, points, pixels) for pose in poses])
 
 
 def estimate_camera_poses(
@@ -96,9 +89,7 @@ def estimate_camera_poses(
     if not known:
         return []
     points, pixels = collect_correspondences(known, tags)
-    starts = [
-        h.pose @ invert_pose(tags[tag]) for tag, detection in known.items() for h in estimate_tag_poses(lens, detection)
-    ]
+    starts = [h.pose @ invert_pose(tags[tag]) for tag in known for h in estimate_tag_poses(lens, known[tag])]
     rough = deduplicate([evaluate_pose(lens, start, points, pixels) for start in starts])
     return deduplicate([refine_pose(lens, hypothesis.pose, points, pixels) for hypothesis in rough])
 

@@ -160,13 +160,11 @@ def solve_poses(
     Raises:
         InputError: no photo can be registered.
     """
-    tag_poses = [
-        {tag: estimate_tag_poses(lens, detection) for tag, detection in s.detections.items()} for s in observations
-    ]
-    counts = Counter(tag for by_tag in tag_poses for tag, poses in by_tag.items() if poses)
+    options = [{tag: estimate_tag_poses(lens, corners) for tag, corners in s.detections.items()} for s in observations]
+    counts = Counter(tag for by_tag in options for tag, poses in by_tag.items() if poses)
     # Ties go to the smallest id, so that the frame does not depend on the order of photos.
     reference = max(sorted(counts), key=counts.__getitem__, default=-1)
-    tags = layout if layout is not None else chain_tag_poses(estimate_relative_poses(tag_poses), reference)
+    tags = layout if layout is not None else chain_tag_poses(estimate_relative_poses(options), reference)
     registered = [(s, poses) for s in observations if (poses := estimate_camera_poses(lens, s.detections, tags))]
     if not registered:
         folder = observations[0].path.parent
@@ -265,7 +263,6 @@ def drop_outliers(
     remaining = [s for s in observations if s.name not in reasons]
     for i, s in enumerate(remaining):
         if s.name in hidden:
-            remaining[i] = replace(
-                s, detections={tag: detection for tag, detection in s.detections.items() if tag != hidden[s.name]}
-            )
+            visible = {tag: corners for tag, corners in s.detections.items() if tag != hidden[s.name]}
+            remaining[i] = replace(s, detections=visible)
     return remaining, reasons

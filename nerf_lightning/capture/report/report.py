@@ -17,20 +17,9 @@ from nerf_lightning.capture.poses.geometry import apply_pose
 from nerf_lightning.capture.poses.pose_solver import RegisteredPhoto
 from nerf_lightning.capture.report.tag_sheet import draw_tag_sheet, subsample_photos
 from nerf_lightning.dataset.intrinsics import Intrinsics
+from nerf_lightning.drawing import style
 from nerf_lightning.drawing.camera_map import plot_camera_map
 from nerf_lightning.drawing.panels import write_png
-from nerf_lightning.drawing.style import (
-    BLUE,
-    DPI,
-    FONT,
-    SKY,
-    VERMILLION,
-    choose_magnification,
-    rasterize_figure,
-    replace_missing_glyphs,
-    set_image_axes,
-    shorten,
-)
 
 MAX_LABELS = 60
 """Photos whose names fit below the bars."""
@@ -49,10 +38,11 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
     lens = capture.calibration.lens
     folders = {"calibration": capture.calibration.photos, "photos": capture.photos}
     numbered = [(number, photo.c2w) for number, photo in enumerate(capture.photos, 1) if photo.c2w is not None]
+    tags = collect_tag_corners(capture)
     figures = {
         "tags": draw_tag_sheet(folders, lens.width / lens.height),
-        "errors": rasterize_figure(plot_errors(folders, capture.calibration)),
-        "cameras": rasterize_figure(plot_camera_map(numbered, capture.scene, collect_tag_corners(capture), "meters")),
+        "errors": style.rasterize_figure(plot_errors(folders, capture.calibration)),
+        "cameras": style.rasterize_figure(plot_camera_map(numbered, capture.scene, tags, "meters")),
     }
     files = [folder / f"{name}.png" for name in figures]
     for figure, file in zip(figures.values(), files, strict=True):
@@ -62,15 +52,13 @@ def write_report(capture: Capture, folder: Path) -> list[Path]:
 
 def collect_tag_corners(capture: Capture) -> dict[int, Float[np.ndarray, "M 3"]]:
     """World positions of the tags' corners, meters, by tag id."""
-    points = {
-        tag: detection.points for photo in capture.photos for tag, detection in photo.observation.detections.items()
-    }
+    points = {tag: corners.points for photo in capture.photos for tag, corners in photo.observation.detections.items()}
     return {tag: apply_pose(pose, points[tag]) for tag, pose in capture.solution.tags.items() if tag in points}
 
 
 def plot_errors(folders: Mapping[str, Sequence[RegisteredPhoto]], calibration: Calibration) -> Figure:
     """Plots each folder's reprojection errors by photo and its residuals over the image plane; below, the lens parameters."""
-    figure = Figure(figsize=(18, 6.5 * len(folders)), dpi=DPI, layout="constrained")
+    figure = Figure(figsize=(18, 6.5 * len(folders)), dpi=style.DPI, layout="constrained")
     grid = figure.subplots(len(folders), 2, squeeze=False, width_ratios=(1.15, 1))
     for (left, right), (title, photos) in zip(grid, folders.items(), strict=True):
         _draw_bars(left, title, photos)
@@ -82,14 +70,15 @@ def plot_errors(folders: Mapping[str, Sequence[RegisteredPhoto]], calibration: C
 def _draw_bars(axes: Axes, title: str, photos: Sequence[RegisteredPhoto]) -> None:
     errors = {number: photo.reprojection_px or 0.0 for number, photo in enumerate(photos, 1) if not photo.reason}
     excluded = [number for number, photo in enumerate(photos, 1) if photo.reason]
-    axes.bar(list(errors), list(errors.values()), color=BLUE)
+    axes.bar(list(errors), list(errors.values()), color=style.BLUE)
     median = float(np.median(list(errors.values())))
     axes.axhline(median, color="black", linestyle="--", linewidth=1, label=f"median {median:.2f} px")
     if excluded:
-        axes.plot(excluded, [0] * len(excluded), "X", color=VERMILLION, markersize=10, clip_on=False, label="excluded")
+        zeros = [0] * len(excluded)
+        axes.plot(excluded, zeros, "X", color=style.VERMILLION, markersize=10, clip_on=False, label="excluded")
     labeled = subsample_photos(photos, MAX_LABELS)
-    labels = [f"{shorten(replace_missing_glyphs(photos[i].name), 24)}  {i + 1}" for i in labeled]
-    axes.set_xticks([i + 1 for i in labeled], labels, rotation=90, fontsize=9, fontfamily=FONT, parse_math=False)
+    labels = [f"{style.shorten(style.replace_missing_glyphs(photos[i].name), 24)}  {i + 1}" for i in labeled]
+    axes.set_xticks([i + 1 for i in labeled], labels, rotation=90, fontsize=9, fontfamily=style.FONT, parse_math=False)
     axes.set_xlim(0.3, len(photos) + 0.7)
     axes.set(title=f"{title}: reprojection error", ylabel="RMS per photo, pixels")
     axes.margins(y=0.12)
@@ -98,13 +87,14 @@ def _draw_bars(axes: Axes, title: str, photos: Sequence[RegisteredPhoto]) -> Non
 
 
 def _draw_residuals(axes: Axes, title: str, photos: Sequence[RegisteredPhoto], lens: Intrinsics) -> None:
-    set_image_axes(axes, lens.width, lens.height)
+    style.set_image_axes(axes, lens.width, lens.height)
     pixels, residuals = collect_residuals(photos)
     hull = cv2.convexHull(pixels.astype(np.float32)).reshape(-1, 2)
-    axes.add_patch(Polygon(hull, facecolor=SKY, alpha=0.15, edgecolor="none"))
+    axes.add_patch(Polygon(hull, facecolor=style.SKY, alpha=0.15, edgecolor="none"))
     typical_length = float(np.percentile(np.linalg.norm(residuals, axis=1), 90))
-    scale = choose_magnification(typical_length, 0.06 * max(lens.width, lens.height))
-    axes.quiver(*pixels.T, *(scale * residuals).T, angles="xy", scale_units="xy", scale=1, color=BLUE, width=0.0016)
+    scale = style.choose_magnification(typical_length, 0.06 * max(lens.width, lens.height))
+    arrows = scale * residuals
+    axes.quiver(*pixels.T, *arrows.T, angles="xy", scale_units="xy", scale=1, color=style.BLUE, width=0.0016)
     coverage = cv2.contourArea(hull) / (lens.width * lens.height)
     text = f"{title}: residuals of {len(pixels)} corners, magnified {scale:g} times; they cover {coverage:.0%} of the photo"
     axes.set_title(text)
@@ -112,9 +102,7 @@ def _draw_residuals(axes: Axes, title: str, photos: Sequence[RegisteredPhoto], l
 
 def collect_residuals(photos: Sequence[RegisteredPhoto]) -> tuple[Float[np.ndarray, "M 2"], Float[np.ndarray, "M 2"]]:
     """Detected corners of all used photos, and their residuals (projected - detected); pixels."""
-    used = [
-        (photo.observation.detections[tag].pixels, rest) for photo in photos for tag, rest in photo.residuals.items()
-    ]
+    used = [(p.observation.detections[tag].pixels, residuals) for p in photos for tag, residuals in p.residuals.items()]
     pixels, residuals = zip(*used, strict=True)
     return np.concatenate(pixels), np.concatenate(residuals)
 

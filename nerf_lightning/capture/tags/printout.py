@@ -48,12 +48,11 @@ def draw_sheet(layout: TagLayout) -> Figure:
     if (high - low + 2 * margin > A4_METERS).any():
         problem = f"{1000 * (high - low)[0]:.0f} x {1000 * (high - low)[1]:.0f} mm of tags"
         raise InputError("print-tags", "tag_size", problem, "tags that fit an A4 page with a margin", "reduce tag_size")
-    figure = Figure(figsize=(A4_METERS[0] / METERS_PER_INCH, A4_METERS[1] / METERS_PER_INCH))
+    width, height = A4_METERS
+    figure = Figure(figsize=(width / METERS_PER_INCH, height / METERS_PER_INCH))
     axes = figure.add_axes((0, 0, 1, 1))
     center = (low + high) / 2
-    axes.set(
-        xlim=center[0] + np.array([-0.5, 0.5]) * A4_METERS[0], ylim=center[1] + np.array([-0.5, 0.5]) * A4_METERS[1]
-    )
+    axes.set(xlim=center[0] + np.array([-0.5, 0.5]) * width, ylim=center[1] + np.array([-0.5, 0.5]) * height)
     axes.set_axis_off()
     side = patterns.markerSize + 2
     module = layout.size / side
@@ -66,7 +65,7 @@ def draw_sheet(layout: TagLayout) -> Figure:
             # The outline hides seams between modules.
             axes.add_patch(Rectangle((x, y), module, module, angle=rotation, color="black", linewidth=0.2))
     text = f"{layout.dictionary}, tags of {100 * layout.size:g} cm. Print without scaling: this line is 10 cm long."
-    bottom = center[1] - A4_METERS[1] / 2 + 0.009
+    bottom = center[1] - height / 2 + 0.009
     axes.plot(center[0] + np.array([-0.5, 0.5]) * RULER_METERS, [bottom, bottom], color="black", linewidth=0.8)
     axes.text(center[0], bottom + 0.002, text, ha="center", va="bottom", fontsize=7)
     return figure

@@ -25,7 +25,7 @@ MAX_HEADERS = 4096
 """Headers cached in memory."""
 DRAFT_SCALES = (8, 4, 2)
 """Downscaling factors of libjpeg's decoder."""
-MIN_OVERSAMPLING = 2
+OVERSAMPLING = 2
 """Minimum oversampling of a JPEG draft that is averaged further: libjpeg's filter is sharper than area averaging, which is
 visible only if little is averaged afterwards (43 dB against averaging the full photo, otherwise above 50)."""
 JPEG_MAGIC = b"\xff\xd8"
@@ -74,9 +74,7 @@ def open_image(path: Path) -> Iterator[Image.Image]:
     with require_file(path).open("rb") as file:
         start = file.read(12)
     if start[8:] in HEIC_BRANDS:
-        require_extra(
-            "heic", "pillow_heif", purpose="the optional extra that reads HEIC photos", hint=", or convert them"
-        )
+        require_extra("heic", "pillow_heif", purpose="the optional extra for HEIC photos", hint=", or convert them")
         import pillow_heif
 
         pillow_heif.register_heif_opener()
@@ -185,8 +183,6 @@ def choose_draft_scale(width: int, height: int, target: tuple[int, int]) -> int:
     for factor in DRAFT_SCALES:
         reduced = width // factor, height // factor
         exact = (width % factor, height % factor) == (0, 0)
-        if exact and (
-            reduced == target or all(a >= MIN_OVERSAMPLING * b for a, b in zip(reduced, target, strict=True))
-        ):
+        if exact and (reduced == target or all(a >= OVERSAMPLING * b for a, b in zip(reduced, target, strict=True))):
             return factor
     return 1

@@ -81,15 +81,13 @@ def find_inliers(
     w2c = cameras[:, 1, :3, :3].transpose(0, 2, 1)
     rotation, baseline = w2c @ cameras[:, 0, :3, :3], w2c @ (cameras[:, 0, :3, 3:] - cameras[:, 1, :3, 3:])
     first, second = (_unit(x * [1, 1, zoom]) for x in (matches.first, matches.second))
-    farthest = (rotation[matches.pair] @ first[..., None])[..., 0]
-    nearest = _unit(MIN_DEPTH_BASELINES * farthest + _unit(baseline[:, :, 0])[matches.pair])
-    normal = _unit(np.cross(farthest, nearest))
-    is_between = (np.cross(farthest, second) * normal).sum(1) >= 0
-    is_between &= (np.cross(second, nearest) * normal).sum(1) >= 0
+    far = (rotation[matches.pair] @ first[..., None])[..., 0]
+    near = _unit(MIN_DEPTH_BASELINES * far + _unit(baseline[:, :, 0])[matches.pair])
+    normal = _unit(np.cross(far, near))
+    is_between = (np.cross(far, second) * normal).sum(1) >= 0
+    is_between &= (np.cross(second, near) * normal).sum(1) >= 0
     arc_distance = np.arcsin(np.abs((second * normal).sum(1)).clip(0, 1))
-    ends = np.minimum(
-        *(2 * np.arcsin(np.linalg.norm(end - second, axis=1).clip(0, 2) / 2) for end in (farthest, nearest))
-    )
+    ends = np.minimum(*(2 * np.arcsin(np.linalg.norm(end - second, axis=1).clip(0, 2) / 2) for end in (far, near)))
     # Pixels far from a pinhole camera's axis subtend smaller angles.
     pixel = np.where(matches.fisheye, 1.0, second[:, 2] ** 2) / zoom * tolerance
     return np.where(is_between & (normal != 0).any(1), arc_distance, ends) <= matches.tolerance * pixel

@@ -78,9 +78,8 @@ def list_conventions(c2w: Poses) -> Iterator[Hypothesis]:
         for flip in flips:
             yield make_hypothesis(fault, hint, roll_quaternions(rotation @ flip, backward) @ flip, center)
         rolled = roll_quaternions(transposed, backward).transpose(0, 2, 1)
-        yield make_hypothesis(
-            fault, hint, rolled, -rolled @ inverse_center
-        )  # world-to-camera poses keep their translations
+        # World-to-camera poses keep their translations.
+        yield make_hypothesis(fault, hint, rolled, -rolled @ inverse_center)
     for flip, change in product(flips, changes):
         fault, hint = "centers and rotations in different world frames", "rotate both to one frame"
         yield make_hypothesis(fault, hint, rotation @ flip, change @ center, is_rare=True)

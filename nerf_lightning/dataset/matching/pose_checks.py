@@ -113,9 +113,8 @@ def compare_with_matches(scene: Scene) -> tuple[list[SceneIssue], bool]:
         text = f"{len(outliers)} training photos whose poses do not fit the others: {named}"
         return [SceneIssue(text, "", is_refinable=True)], True
     val_pairs = [pair for pair in pairs if max(pair.first, pair.second) >= len(train)]
-    held_out = given
-    if has_enough_matches(val_pairs):
-        held_out = compute_inlier_ratio(Matches.from_pairs(val_pairs, cameras), c2w)
+    val_matches = Matches.from_pairs(val_pairs, cameras) if has_enough_matches(val_pairs) else None
+    held_out = given if val_matches is None else compute_inlier_ratio(val_matches, c2w)
     if held_out - chance >= MIN_HELD_OUT_RATIO * (given - chance):
         return [], True
     text = f"held-out photos whose poses explain {held_out:.0%} of the matches, those of training photos {given:.0%}"
@@ -151,14 +150,12 @@ def fit_focal(matches: Matches, c2w: Poses, focal: float) -> Hypothesis:
 def choose_best_hypothesis(matches: Matches, hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, float]:
     """Chooses the first of the best hypotheses, and returns it with its inlier ratio."""
     best, ratio, quality = hypotheses[0], 0.0, 0.0
-    for hypothesis in hypotheses:
+    for h in hypotheses:
         # The finer tolerance separates hypotheses that are nearly equal over the angles of these photos.
-        coarse, fine = (
-            compute_inlier_ratio(matches, hypothesis.c2w, hypothesis.zoom, slack) for slack in (1.0, FINE_TOLERANCE)
-        )
-        score = (coarse + fine) * (RARE_PENALTY if hypothesis.is_rare else 1.0)
+        coarse, fine = (compute_inlier_ratio(matches, h.c2w, h.zoom, slack) for slack in (1.0, FINE_TOLERANCE))
+        score = (coarse + fine) * (RARE_PENALTY if h.is_rare else 1.0)
         if score * TIE_RATIO > quality:
-            best, ratio, quality = hypothesis, coarse, score
+            best, ratio, quality = h, coarse, score
     return best, ratio
 
 

@@ -13,13 +13,7 @@ from jaxtyping import Float
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from nerf_lightning.dataset.formats.image_files import (
-    DECODE_ERRORS,
-    EXIF_IFD_TAG,
-    MAX_DECODE_THREADS,
-    read_header,
-    read_pixels,
-)
+from nerf_lightning.dataset.formats import image_files
 from nerf_lightning.dataset.intrinsics import Intrinsics
 from nerf_lightning.dataset.resize import fit_size
 from nerf_lightning.utils.progress import progress_bar, track_progress
@@ -116,15 +110,13 @@ def register_with_known_poses(
     pycolmap.triangulate_points(start, database, copies, folder, options=options).write_binary(folder)
     models = pycolmap.incremental_mapping(database, copies, output, options, input_path=folder)
     scale = lens.width / camera.width
-    return {
-        parse_index(image): (
-            np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]),
-            scale * _compute_rms_error(image, model),
-        )
-        for model in models.values()
-        for image in model.images.values()
-        if image.has_pose and parse_index(image) not in known and image.num_points3D >= MIN_POSE_POINTS
-    }
+    registered = {}
+    for model in models.values():
+        for image in model.images.values():
+            if image.has_pose and parse_index(image) not in known and image.num_points3D >= MIN_POSE_POINTS:
+                w2c = np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]])
+                registered[parse_index(image)] = w2c, scale * _compute_rms_error(image, model)
+    return registered
 
 
 def match_photos(
@@ -153,7 +145,7 @@ def match_photos(
         with pycolmap.Database.open(database) as content:
             reader.existing_camera_id = content.write_camera(camera)
     copies.mkdir()
-    with ThreadPoolExecutor(MAX_DECODE_THREADS) as pool:
+    with ThreadPoolExecutor(image_files.MAX_DECODE_THREADS) as pool:
         written = pool.map(_write_copy, photos, [copies / make_copy_name(number) for number in range(len(photos))])
         lenses = list(track_progress(written, len(photos), "reading photos"))
     for lens in dict.fromkeys(lenses):
@@ -197,7 +189,7 @@ def parse_index(image: "pycolmap.Image") -> int:
 
 def _write_copy(photo: Path, file: Path) -> tuple[tuple[int, int], bytes]:
     """Writes a reduced upright JPEG and returns the full size and the EXIF tags, which identify the lens."""
-    image = Image.fromarray(np.ascontiguousarray(read_pixels(photo, upright=True)[..., :3]))
+    image = Image.fromarray(np.ascontiguousarray(image_files.read_pixels(photo, upright=True)[..., :3]))
     tags = read_lens_tags(photo)
     small = image.resize(fit_size(*image.size, COPY_SIDE_PX), Image.Resampling.BOX)
     small.save(file, quality=98, subsampling=0, exif=tags)
@@ -206,17 +198,15 @@ def _write_copy(photo: Path, file: Path) -> tuple[tuple[int, int], bytes]:
 
 def read_lens_tags(photo: Path) -> bytes:
     """Reads the lens-related EXIF tags of a photo; empty if missing or broken."""
-    tags, kept = read_header(photo).tags, Image.Exif()
+    tags, kept = image_files.read_header(photo).tags, Image.Exif()
     try:
         kept.update({tag: str(tags[tag]) for tag in (MAKE_TAG, MODEL_TAG) if tag in tags})
-        if float(tags.get(FOCAL_TAG, 0)) > 0:
-            kept.get_ifd(EXIF_IFD_TAG)[FOCAL_TAG] = IFDRational(
-                Fraction(float(tags[FOCAL_TAG])).limit_denominator(1000)
-            )
-        if float(tags.get(FOCAL_35MM_TAG, 0)) > 0:
-            kept.get_ifd(EXIF_IFD_TAG)[FOCAL_35MM_TAG] = round(float(tags[FOCAL_35MM_TAG]))
+        if (focal := float(tags.get(FOCAL_TAG, 0))) > 0:
+            kept.get_ifd(image_files.EXIF_IFD_TAG)[FOCAL_TAG] = IFDRational(Fraction(focal).limit_denominator(1000))
+        if (focal := float(tags.get(FOCAL_35MM_TAG, 0))) > 0:
+            kept.get_ifd(image_files.EXIF_IFD_TAG)[FOCAL_35MM_TAG] = round(focal)
         return kept.tobytes()
-    except DECODE_ERRORS:
+    except image_files.DECODE_ERRORS:
         return b""
 
 

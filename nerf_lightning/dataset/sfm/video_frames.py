@@ -109,16 +109,14 @@ def decode_frames(video: Path, label: str) -> Iterator["av.VideoFrame"]:
 
 def measure_frames(video: Path) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
     """Measures the motion up to each frame of a video, 0 for the first, and its sharpness."""
-    motion, sharpness, previous = [], [], None
+    motion, sharpness, last = [], [], None
     for frame in decode_frames(video, "measuring blur and motion"):
         size = fit_size(frame.width, frame.height, SHARPNESS_SIDE)
         picture = frame.reformat(*size, "gray", interpolation="AREA").to_ndarray()
         sharpness.append(measure_sharpness(picture))
         small = cv2.resize(picture, fit_size(*size, MOTION_SIDE), interpolation=cv2.INTER_AREA)
-        motion.append(
-            measure_motion(previous, small) if previous is not None and previous.shape == small.shape else 0.0
-        )
-        previous = small
+        motion.append(measure_motion(last, small) if last is not None and last.shape == small.shape else 0.0)
+        last = small
     return np.array(motion), np.array(sharpness)
 
 
