@@ -35,8 +35,8 @@ def intersect_steps(
 
 @kernel()
 def count_steps(
-    origins, directions, near, far, shift, center, half_size, occupied, counts, rays, samples, step,
-    resolution: tl.constexpr, R: tl.constexpr, S: tl.constexpr,
+    origins, directions, near, far, shift, center, half_size, occupied, counts, rays, samples, step, resolution,
+    R: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
     """Writes the steps of each ray in occupied cells, from the second entry on."""
     row = tl.program_id(0) * R + tl.arange(0, R)
@@ -83,8 +83,8 @@ def pad_buffers(depth_out, t_out, dt_out, ray_out, offsets, rays, capacity, S: t
 @kernel()
 def write_steps(
     origins, directions, near, far, shift, center, half_size, occupied, offsets, t_out, dt_out, ray_out,
-    rays, samples, step, capacity,
-    resolution: tl.constexpr, R: tl.constexpr, S: tl.constexpr,
+    rays, samples, step, resolution, capacity,
+    R: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
     """Packs the steps in occupied cells, as far as they fit."""
     row = tl.program_id(0) * R + tl.arange(0, R)
@@ -136,11 +136,11 @@ def march(
         occupied,
     )
     grid = (triton.cdiv(count, RAYS_PER_PROGRAM),)
-    blocks = {"resolution": resolution, "R": RAYS_PER_PROGRAM, "S": STEPS_PER_BLOCK}
+    blocks = {"R": RAYS_PER_PROGRAM, "S": STEPS_PER_BLOCK}
     counts = torch.zeros(count + 1, dtype=torch.int64, device=near.device)
-    count_steps(grid, *inputs, counts, count, samples, step, **blocks)
+    count_steps(grid, *inputs, counts, count, samples, step, resolution, **blocks)
     offsets = counts.cumsum(0)
     size = int(offsets[-1]) if capacity is None else capacity
     buffers = *near.new_empty(2, size).unbind(), torch.empty(size, dtype=torch.int64, device=near.device)
-    write_steps(grid, *inputs, offsets, *buffers, count, samples, step, size, **blocks)
+    write_steps(grid, *inputs, offsets, *buffers, count, samples, step, resolution, size, **blocks)
     return *buffers, offsets
