@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from nerf_lightning.dataset import Views, open_scene
 from nerf_lightning.errors import InputError
 from nerf_lightning.runs.checkpoint import RESUME_KEYS, read_checkpoint
-from nerf_lightning.runs.compact import encode, load_compact
+from nerf_lightning.runs.compact import encode_system, load_compact
 from nerf_lightning.runs.folder import config_to_dict, load_config, load_run
 from nerf_lightning.synthetic.bricks import bricks
 from nerf_lightning.utils.parsing import read_json, read_npy, read_yaml
@@ -71,7 +71,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory, small_run: Path, isolated_ca
     (folder / "options.yaml").write_text(yaml.safe_dump({"a": {"b": [1, 2.5, None, "x"]}, "day": "2020-01-02"}))
     shutil.copytree(small_run, folder / "run")
     run = load_run(folder / "run")
-    (folder / "run" / "compact.npz").write_bytes(encode(run.system, "byte", config_to_dict(run.cfg), run.scene))
+    (folder / "run" / "compact.npz").write_bytes(encode_system(run.system, "byte", config_to_dict(run.cfg), run.scene))
     return folder
 
 
