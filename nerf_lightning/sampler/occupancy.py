@@ -48,11 +48,11 @@ class SampleCapacity:
         return steps, kept
 
     def record_counts(
-        self, is_full_pass: bool, marched: Int[Tensor, "R_plus_1"], kept: Int[Tensor, "R_plus_1"]
+        self, is_full_pass: bool, marched_offsets: Int[Tensor, "R_plus_1"], kept_offsets: Int[Tensor, "R_plus_1"]
     ) -> None:
         """Records the counts of a training step, given by the offsets of its marched and its kept steps."""
-        if marched.device.type != "cpu":
-            self.recorded[is_full_pass] = len(kept) - 1, marched[-1], kept[-1]
+        if marched_offsets.device.type != "cpu":
+            self.recorded[is_full_pass] = len(kept_offsets) - 1, marched_offsets[-1], kept_offsets[-1]
             if is_full_pass not in self.per_ray:
                 self.read_counts()
 

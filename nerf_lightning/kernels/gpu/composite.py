@@ -43,21 +43,9 @@ def composite_rays(density, rgb, t, dt, offsets, out, samples, rays, stride, cha
 
 @kernel(num_warps=1)
 def differentiate_rays(
-    density,
-    rgb,
-    t,
-    dt,
-    offsets,
-    out,
-    grad,
-    grad_density,
-    grad_rgb,
-    samples,
-    rays,
-    stride,
-    channel_stride,
+    density, rgb, t, dt, offsets, out, grad, grad_density, grad_rgb, samples, rays, stride, channel_stride,
     B: tl.constexpr,
-):
+):  # fmt: skip
     """Gradients of `composite_rays`. The part behind a sample is the ray's total less the part before it."""
     ray = tl.program_id(0)
     first = tl.load(offsets + ray).to(tl.int32)
@@ -131,17 +119,9 @@ def select_visible(
 
 @kernel(num_warps=1)
 def count_visible(
-    optical_depth,
-    dt,
-    offsets,
-    min_depth,
-    counts,
-    samples,
-    max_depth,
-    max_dropped,
-    IS_PADDED: tl.constexpr,
+    optical_depth, dt, offsets, min_depth, counts, samples, max_depth, max_dropped, IS_PADDED: tl.constexpr,
     B: tl.constexpr,
-):
+):  # fmt: skip
     """Writes the visible samples of each ray, from the second entry on."""
     ray = tl.program_id(0)
     first = tl.minimum(tl.load(offsets + ray), samples).to(tl.int32)
@@ -160,14 +140,14 @@ def count_visible(
 
 @kernel(num_warps=1)
 def write_visible(
-    optical_depth, t, dt, offsets, min_depth, kept, depth_out, t_out, dt_out, ray_out,
+    optical_depth, t, dt, offsets, min_depth, kept_offsets, depth_out, t_out, dt_out, ray_out,
     rays, samples, capacity, max_depth, max_dropped, IS_PADDED: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """Packs the visible samples, as far as they fit."""
     ray = tl.program_id(0)
     first = tl.minimum(tl.load(offsets + ray), samples).to(tl.int32)
     last = tl.minimum(tl.load(offsets + ray + 1), samples).to(tl.int32)
-    next_slot = tl.load(kept + ray).to(tl.int32)
+    next_slot = tl.load(kept_offsets + ray).to(tl.int32)
     depth, thin = 0.0, 0.0
     for begin in range(first, last, B):
         i = begin + tl.arange(0, B)
@@ -184,7 +164,7 @@ def write_visible(
         next_slot += tl.sum(count)
         depth += tl.sum(own_depth)
         thin += tl.sum(own_thin)
-    pad_buffers(depth_out, t_out, dt_out, ray_out, kept, rays, capacity, B)
+    pad_buffers(depth_out, t_out, dt_out, ray_out, kept_offsets, rays, capacity, B)
 
 
 def filter_visible(
@@ -198,9 +178,10 @@ def filter_visible(
     limits, options = (-math.log(early_stop_eps), max_dropped), {"IS_PADDED": capacity is not None, "B": BLOCK}
     counts = torch.zeros(rays + 1, dtype=torch.int64, device=t.device)
     count_visible((rays,), optical_depth, dt, offsets, min_depth, counts, len(t), *limits, **options)
-    kept = counts.cumsum(0)
-    size = int(kept[-1]) if capacity is None else capacity
-    buffers = *t.new_empty(3, size).unbind(), torch.empty(size, dtype=torch.int64, device=t.device)
-    inputs = optical_depth, t, dt, offsets, min_depth, kept
-    write_visible((rays,), *inputs, *buffers, rays, len(t), size, *limits, **options)
-    return buffers[0], (*buffers[1:], kept)
+    kept_offsets = counts.cumsum(0)
+    size = int(kept_offsets[-1]) if capacity is None else capacity
+    depths, t_out, dt_out = t.new_empty(3, size).unbind()
+    ray = torch.empty(size, dtype=torch.int64, device=t.device)
+    inputs = optical_depth, t, dt, offsets, min_depth, kept_offsets
+    write_visible((rays,), *inputs, depths, t_out, dt_out, ray, rays, len(t), size, *limits, **options)
+    return depths, (t_out, dt_out, ray, kept_offsets)

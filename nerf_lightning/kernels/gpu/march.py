@@ -141,6 +141,7 @@ def march(
     count_steps(grid, *inputs, counts, count, samples, step, resolution, **blocks)
     offsets = counts.cumsum(0)
     size = int(offsets[-1]) if capacity is None else capacity
-    buffers = *near.new_empty(2, size).unbind(), torch.empty(size, dtype=torch.int64, device=near.device)
-    write_steps(grid, *inputs, offsets, *buffers, count, samples, step, resolution, size, **blocks)
-    return *buffers, offsets
+    t, dt = near.new_empty(2, size).unbind()
+    ray = torch.empty(size, dtype=torch.int64, device=near.device)
+    write_steps(grid, *inputs, offsets, t, dt, ray, count, samples, step, resolution, size, **blocks)
+    return t, dt, ray, offsets

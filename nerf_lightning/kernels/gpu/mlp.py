@@ -54,20 +54,9 @@ def relu(h):
 
 @triton.jit
 def compute_hidden(
-    x,
-    extra,
-    w1,
-    b1,
-    w2,
-    b2,
-    inputs,
-    extras,
-    hidden,
-    TWO: tl.constexpr,
-    IN: tl.constexpr,
-    EX: tl.constexpr,
+    x, extra, w1, b1, w2, b2, inputs, extras, hidden, TWO: tl.constexpr, IN: tl.constexpr, EX: tl.constexpr,
     HID: tl.constexpr,
-):
+):  # fmt: skip
     """Hidden layers [B, HID]; with one, it stands for both."""
     width = inputs + extras
     first = tl.dot(x, load_transposed(w1, 0, inputs, width, hidden, IN, HID), input_precision="tf32")
