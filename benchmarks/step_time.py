@@ -71,8 +71,7 @@ def run_plain_step(
     optimizer.step()
     assert system.stats.squared_errors is not None
     data.update_error_map(system.stats.squared_errors, system.stats.complete_rays)
-    if system.stats.is_sample_count_exact:
-        data.adapt_num_rays(system.stats.samples)
+    data.adapt_num_rays(system.stats.samples)
     synchronize(system.device)
     return time.perf_counter() - start
 
@@ -107,8 +106,7 @@ def measure_method(overrides: list[str], device: torch.device) -> Row:
     times, samples, rays = [], [], []
     for number in range(first + period, first + (1 + TIMED_PERIODS) * period):
         times.append(1e3 * step(number))
-        if system.stats.is_sample_count_exact:
-            samples.append(system.stats.samples)
+        samples.append(system.stats.samples)
         rays.append(system.stats.rays)
     between, whole = counts[1:] or counts, counts  # the first step of a period updates the sampler
     return {

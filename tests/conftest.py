@@ -13,6 +13,8 @@ from typing import Any
 # Before OpenMP starts, here and in processes that tests start: threads that wait would spin, and take the cores from the tests
 # beside them.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# Before anything imports Triton: its interpreter runs the GPU kernels on CPU tensors.
+os.environ["TRITON_INTERPRET"] = "1"
 
 # While the hook below loads a module it looks for all compiled files under a name of its own, those of libraries too, and so
 # would compile thousands again: what takes long to import comes first.
@@ -31,17 +33,17 @@ import tests.helpers.typechecker  # noqa: F401  (the hook below imports the firs
 torch.set_flush_denormal(True)
 
 ROOT = Path(__file__).resolve().parents[1]
-KERNELS = "nerf_lightning.kernels.cpu"
+KERNELS = ("nerf_lightning.kernels.cpu.", "nerf_lightning.kernels.gpu.")
 DEFAULT_HANDLERS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
 """Python's own: a shell that starts tests in the background has them ignore Ctrl-C."""
 
 
 def checked_modules() -> list[str]:
-    """All modules but those in `KERNELS`, whose functions numba must see undecorated, and the packages that hold it."""
+    """All modules but those in `KERNELS`, whose functions numba and Triton must see undecorated, and packages of these."""
     files = (file.relative_to(ROOT).with_suffix("") for file in (ROOT / "nerf_lightning").rglob("*.py"))
     names = {".".join(file.parts).removesuffix(".__init__") for file in files}
     # The hook takes a name for everything below it.
-    return sorted(n for n in names if not f"{KERNELS}.".startswith(f"{n}.") and not n.startswith(f"{KERNELS}."))
+    return sorted(n for n in names if not any(k.startswith(f"{n}.") or n.startswith(k) for k in KERNELS))
 
 
 # Before anything imports the package: from here on a wrong shape fails the test that met it.

@@ -73,8 +73,7 @@ def train_steps(system: System, data: object, steps: int, where: torch.device) -
         loss.backward()
         optimizer.step()
         optimizer.zero_grad()
-        if stats.is_sample_count_exact:
-            data.adapt_num_rays(stats.samples)
+        data.adapt_num_rays(stats.samples)
         losses.append(float(loss.detach()))
     return losses
 
@@ -104,7 +103,7 @@ def test_training_steps_on_device_match_cpu(variant: str, unbounded: bool, devic
     assert found[NAME][0] == pytest.approx(found["cpu"][0], rel=1e-5)
 
 
-MAX_OPERATIONS = {"tensorf": 256, "hashgrid": 255, "voxels": 258, "mlp": 227}
+MAX_OPERATIONS = {"tensorf": 256, "hashgrid": 255, "voxels": 259, "mlp": 227}
 """Operations a step between two updates of the sampler: forward, backward, optimizer. Each takes 5 to 10 microseconds."""
 
 
@@ -128,13 +127,11 @@ def test_training_step_on_device_needs_few_operations_and_no_wait(name: str, dev
             sum_losses(losses).backward()
             optimizer.step()
             optimizer.zero_grad()
-        if stats.is_sample_count_exact:
-            data.adapt_num_rays(stats.samples)
+        data.adapt_num_rays(stats.samples)
         counts.append(count)
     for count in counts[-period + 3 :]:  # the first ones after an update make what is then kept for the device
         assert count.operations <= MAX_OPERATIONS[name], count.names.most_common()
-        assert count.waits == 0, count.names.most_common()
-    assert 0 < sum(count.waits for count in counts[-period:]) <= 8, "for an update"
+    assert sum(count.waits for count in counts[-period:]) == 1, "to read the sample counts"
 
 
 @pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])
@@ -156,15 +153,15 @@ def test_step_rays_beyond_capacity_do_not_train(device: torch.device, tmp_path: 
     batch, sampler = data.draw(2).to(device), system.sampler
     sampler.update(2, system.field.density, step_generator(0, Stream.STEP, 2, device))
     before = sampler.capacity.per_ray
-    assert before is not None, "there is room for as many as were counted"
-    narrow = before[0], 0.4 * before[1]
+    steps, kept = before[False]
+    narrow = {False: (steps, 0.4 * kept)}
 
-    def sample_with_capacity(per_ray: tuple[float, float] | None) -> Any:
+    def sample_with_capacity(per_ray: dict[bool, tuple[float, float]]) -> Any:
         sampler.capacity.per_ray = per_ray
         return sampler(batch.rays, system.field.density, step_generator(0, Stream.STEP, 2, device))
 
     with torch.no_grad():
-        counted, roomy, tight = sample_with_capacity(None), sample_with_capacity(before), sample_with_capacity(narrow)
+        counted, roomy, tight = sample_with_capacity({}), sample_with_capacity(before), sample_with_capacity(narrow)
     ends = counted.offsets.tolist()
     assert counted.complete is None and roomy.complete.all() and roomy.offsets.tolist() == ends
     torch.testing.assert_close(roomy.t[: ends[-1]].cpu(), counted.t.cpu())

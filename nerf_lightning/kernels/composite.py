@@ -6,8 +6,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels import cpu, gpu
+from nerf_lightning.kernels.backend import has_fast_kernel, has_gpu_kernel
 from nerf_lightning.kernels.march import Packed, first_true_indices, offsets_from_counts
 from nerf_lightning.kernels.segment_sums import exclusive_sum
 
@@ -85,6 +85,8 @@ def composite(
     """
     if has_fast_kernel(density, rgb, constants=(t, dt)):
         return _Composite.apply(density, rgb, t, dt, offsets)
+    if has_gpu_kernel(density, rgb, constants=(t, dt)):
+        return gpu.composite.Composite.apply(density, rgb, t, dt, offsets)
     return composite_reference(density, rgb, t, dt, ray, offsets)
 
 
@@ -135,6 +137,10 @@ def filter_visible(
         max_dropped: maximum total optical depth of a ray's dropped transparent samples; later ones stay.
     """
     t, dt, ray, offsets = packed
+    if has_gpu_kernel(optical_depth, constants=(t, dt)):
+        return gpu.composite.filter_visible(
+            optical_depth, packed, early_stop_eps, min_optical_depth, capacity, max_dropped
+        )
     if capacity is not None or not has_fast_kernel(optical_depth, constants=(t, dt)):
         return filter_visible_reference(optical_depth, packed, early_stop_eps, min_optical_depth, capacity, max_dropped)
     keep, counts = torch.empty(len(t), dtype=torch.bool), torch.empty(len(offsets) - 1, dtype=torch.int64)

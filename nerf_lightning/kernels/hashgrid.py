@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels import cpu, gpu
+from nerf_lightning.kernels.backend import has_fast_kernel, has_gpu_kernel
 from nerf_lightning.kernels.cached_constants import cache_constants
 
 # Instant-NGP, eq. 4: pi_1 = 1, pi_2 = 2654435761, pi_3 = 805459861; the second as the int32 it wraps to.
@@ -167,4 +167,6 @@ def hash_interpolate(
     """
     if has_fast_kernel(tables, unit):
         return _HashInterpolate.apply(tables, unit, resolutions, sizes)
+    if unit.shape[1] == 3 and tables.shape[1].bit_count() == 1 and has_gpu_kernel(tables, unit):
+        return gpu.hashgrid.HashInterpolate.apply(tables, unit, resolutions, sizes)
     return hash_interpolate_reference(tables, unit, resolutions, sizes)

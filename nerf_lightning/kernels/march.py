@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels import cpu, gpu
+from nerf_lightning.kernels.backend import has_fast_kernel, has_gpu_kernel
 from nerf_lightning.kernels.cached_constants import cache_constants
 
 INTERVALS_PER_CHUNK = 1 << 20
@@ -123,7 +123,10 @@ def march(
             length 0; rays whose `offsets` end beyond it are truncated.
         chunk: intervals that the reference tests at a time, to bound its memory.
     """
-    if capacity is not None or not has_fast_kernel(constants=(rays.origins, rays.directions, near, far, shift)):
+    inputs = rays.origins, rays.directions, near, far, shift
+    if not bounds.unbounded and has_gpu_kernel(constants=inputs):
+        return gpu.march.march(rays, bounds, near, far, shift, occupied, samples, step, capacity)
+    if capacity is not None or not has_fast_kernel(constants=inputs):
         return march_reference(rays, bounds, near, far, shift, occupied, samples, step, capacity, chunk)
     marcher = RayMarcher(rays, bounds, near, far, shift, occupied, samples, step)
     return marcher.advance(torch.arange(len(rays)), samples + 1)

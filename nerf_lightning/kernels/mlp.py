@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import linear
 
-from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels import cpu, gpu
+from nerf_lightning.kernels.backend import has_fast_kernel, has_gpu_kernel
 
 Layers = Sequence[tuple[Float[Tensor, "_ _"], Float[Tensor, "_"]]]
 """Matrix [outputs, inputs] and bias [outputs] of each layer."""
@@ -67,11 +67,13 @@ def mlp_heads(
 ) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:
     """`mlp` that returns the first `num_head` outputs and the rest separately, without a split."""
     parameters = [parameter for layer in layers for parameter in layer]
-    if not has_fast_kernel(x, *parameters, *(() if extra is None else (extra,))):
-        out = mlp_reference(x, layers, None if extra is None else extra.detach())
-        head, rest = out.split([num_head, out.shape[1] - num_head], dim=1)
-        return head, rest
-    return _MLP.apply(x, x.new_empty(len(x), 0) if extra is None else extra, num_head, *parameters)
+    rest = x.new_empty(len(x), 0) if extra is None else extra.detach()
+    if has_fast_kernel(x, *parameters, rest):
+        return _MLP.apply(x, rest, num_head, *parameters)
+    if has_gpu_kernel(x, *parameters, rest) and gpu.mlp.is_supported(layers, rest.shape[1], x.device):
+        return gpu.mlp.MLP.apply(x, rest, num_head, *parameters)
+    out = mlp_reference(x, layers, rest)
+    return out[:, :num_head], out[:, num_head:]
 
 
 def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Float[Tensor, "N O"]:

@@ -7,8 +7,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels import cpu, gpu
+from nerf_lightning.kernels.backend import has_fast_kernel, has_gpu_kernel
 from nerf_lightning.kernels.cached_constants import cache_constants
 
 PLANE_AXES = ((1, 2), (0, 2), (0, 1))
@@ -78,7 +78,7 @@ def _products(
     return (corners * at.plane_weights).sum(0) * (ends * at.line_weights).sum(0)
 
 
-def _products_reference(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 3"]) -> list[Tensor]:
+def products_reference(*volumes: tuple[Tensor, Tensor], unit: Float[Tensor, "N 3"]) -> list[Tensor]:
     """Products [N, 3, C] of volumes of the same resolution, in plain PyTorch for every device."""
     if unit.device.type == "cuda":
         return [grid_sample_products(*volume, unit) for volume in volumes]
@@ -130,7 +130,9 @@ def plane_line_products(
     """
     if has_fast_kernel(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, False)
-    return _products_reference((planes, lines), unit=unit)[0].flatten(1)
+    if has_gpu_kernel(planes, lines, constants=(unit,)):
+        return gpu.vector_matrix.PlaneLine.apply(planes, lines, unit, False)
+    return products_reference((planes, lines), unit=unit)[0].flatten(1)
 
 
 def plane_line_sum(
@@ -139,7 +141,9 @@ def plane_line_sum(
     """Sum of `plane_line_products` at each position."""
     if has_fast_kernel(planes, lines, unit):
         return _PlaneLine.apply(planes, lines, unit, True)[:, 0]
-    return _products_reference((planes, lines), unit=unit)[0].sum((1, 2))
+    if has_gpu_kernel(planes, lines, constants=(unit,)):
+        return gpu.vector_matrix.PlaneLine.apply(planes, lines, unit, True)
+    return products_reference((planes, lines), unit=unit)[0].sum((1, 2))
 
 
 def plane_line_sum_and_products(
@@ -148,7 +152,8 @@ def plane_line_sum_and_products(
     unit: Float[Tensor, "N 3"],
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N threeB"]]:
     """`plane_line_sum` of one volume and `plane_line_products` of another of the same resolution."""
-    if has_fast_kernel(*summed, unit) and has_fast_kernel(*separate, unit):
+    is_on_gpu = has_gpu_kernel(*summed, *separate, constants=(unit,))
+    if is_on_gpu or has_fast_kernel(*summed, *separate, unit):
         return plane_line_sum(*summed, unit), plane_line_products(*separate, unit)
-    total, products = _products_reference(summed, separate, unit=unit)
+    total, products = products_reference(summed, separate, unit=unit)
     return total.sum((1, 2)), products.flatten(1)

@@ -4,7 +4,7 @@ import math
 from typing import Annotated, Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Cameras, Rays
@@ -28,24 +28,41 @@ INVISIBLE_DEPTH = 0.5 / 255
 class SampleCapacity:
     """Capacity of the fixed-size sample buffers on accelerators, where an exact count needs a host-device sync.
 
-    On a CPU samples are always counted; elsewhere once after each change of the cells.
+    On a CPU samples are always counted. Elsewhere the first step of each kind counts; later ones record their counts on
+    the device, and `read_counts` reads them once per update of the cells.
     """
 
-    HEADROOM = 1.25  # relative to the last exact count
-    per_ray: tuple[float, float] | None = None
-    """Steps in occupied cells and kept steps per ray at the last count; None: the next training step counts."""
+    HEADROOM = 1.25  # relative to the last count
 
-    def sizes(self, num_rays: int) -> tuple[int, int] | tuple[None, None]:
+    def __init__(self) -> None:
+        self.per_ray: dict[bool, tuple[float, float]] = {}
+        """Steps in occupied cells and kept steps per ray at the last count, for full passes (True) and other steps."""
+        self.recorded: dict[bool, tuple[int, Tensor, Tensor]] = {}
+        """Rays of newer steps, and their numbers of steps on the device."""
+
+    def sizes(self, num_rays: int, is_full_pass: bool) -> tuple[int, int] | tuple[None, None]:
         """Capacities for marched and for kept steps; None to count exactly."""
-        if self.per_ray is None:
+        if is_full_pass not in self.per_ray:
             return None, None
-        steps, kept = (math.ceil(self.HEADROOM * count * num_rays) for count in self.per_ray)
+        steps, kept = (math.ceil(self.HEADROOM * count * num_rays) for count in self.per_ray[is_full_pass])
         return steps, kept
 
-    def record_counts(self, rays: Rays, steps: int, visible: int) -> None:
-        """Records an exact count."""
-        if rays.origins.device.type != "cpu":
-            self.per_ray = max(steps, 1) / len(rays), max(visible, 1) / len(rays)
+    def record_counts(
+        self, is_full_pass: bool, marched_offsets: Int[Tensor, "R_plus_1"], kept_offsets: Int[Tensor, "R_plus_1"]
+    ) -> None:
+        """Records the counts of a training step, given by the offsets of its marched and its kept steps."""
+        if marched_offsets.device.type != "cpu":
+            self.recorded[is_full_pass] = len(kept_offsets) - 1, marched_offsets[-1], kept_offsets[-1]
+            if is_full_pass not in self.per_ray:
+                self.read_counts()
+
+    def read_counts(self) -> None:
+        """Reads the recorded counts: a single host-device sync."""
+        if self.recorded:
+            totals = torch.stack([total for _, *row in self.recorded.values() for total in row]).tolist()
+            for (kind, (rays, *_)), *row in zip(self.recorded.items(), totals[::2], totals[1::2], strict=True):
+                self.per_ray[kind] = max(row[0], 1) / rays, max(row[1], 1) / rays
+            self.recorded.clear()
 
 
 class OccupancySampler(Sampler):
@@ -108,6 +125,10 @@ class OccupancySampler(Sampler):
         self.capacity = SampleCapacity()
 
     @property
+    def samples_per_ray(self) -> float | None:
+        return self.capacity.per_ray.get(False, (0.0, None))[1]
+
+    @property
     def samples(self) -> int:
         """Steps along the diagonal in training."""
         return self.requested_samples or TRAIN_STEPS_PER_CELL * self.grid.resolution
@@ -133,7 +154,7 @@ class OccupancySampler(Sampler):
         samples = self.samples
         self.grid.resize(resolution)
         self.grid.optical_depth *= samples / self.samples
-        self.capacity.per_ray = self.min_depth = None
+        self.capacity, self.min_depth = SampleCapacity(), None
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
@@ -146,17 +167,17 @@ class OccupancySampler(Sampler):
             return Samples(*packed, optical_depth=depths)
         shift = torch.rand(near.shape, generator=generator, device=near.device)
         cells = self.grid.occupied if self.full_pass else self.grid.active
-        (capacity, kept_capacity), eps = self.capacity.sizes(len(rays)), self.early_stop_eps
+        (capacity, kept_capacity), eps = self.capacity.sizes(len(rays), self.full_pass), self.early_stop_eps
         depths, packed = self._march(rays, density, near, far, shift, cells, self.samples, eps, capacity)
         if self.min_depth is None:
             self.min_depth = self.grid.mean_active_depth().mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
         _, kept = filter_visible(depths, packed, eps, self.min_depth, kept_capacity)
         positions = Samples(*kept).positions(rays)
         self.grid.mark_visible(positions, self.updates)
+        self.capacity.record_counts(self.full_pass, packed[3], kept[3])
         if capacity is not None and kept_capacity is not None:
             complete = (packed[3][1:] <= capacity) & (kept[3][1:] <= kept_capacity)
             return Samples(*kept, complete, positions)
-        self.capacity.record_counts(rays, len(depths), len(kept[0]))
         return Samples(*kept, cached_positions=positions)
 
     @torch.no_grad()
@@ -193,17 +214,15 @@ class OccupancySampler(Sampler):
         super()._load_from_state_dict(*arguments)
 
     def restart(self, step: int) -> None:
-        self.first_step = step
-        self.capacity.per_ray = None
+        self.first_step, self.capacity = step, SampleCapacity()
 
     @torch.no_grad()
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         self.updates, phase = divmod(step, self.update_every)
         self.full_pass = not phase
-        if phase <= 1:  # the cells have changed since the previous step
-            self.capacity.per_ray = None
         if phase:
             return
+        self.capacity.read_counts()
 
         def optical_depth(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
             return self._query(density, positions) * self.step_size(self.samples)

@@ -142,6 +142,11 @@ class Sampler(BoundedModule):
         """Rays sampled together in evaluation."""
         return max(1, self.chunk // SAMPLES_PER_RAY)
 
+    @property
+    def samples_per_ray(self) -> float | None:
+        """Samples per ray at the last count, if training steps have buffers of fixed size; None: `Samples` holds them all."""
+        return None
+
     def param_groups(self) -> list[dict[str, Any]]:
         """Named parameter groups of the optimizer for the sampler's parameters."""
         return []

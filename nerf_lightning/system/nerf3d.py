@@ -134,10 +134,11 @@ class NeRF3D(System):
             "photometric": (squared_errors if batch.weights is None else squared_errors * batch.weights).mean(),
             **self.regularize(output, samples, batch),
         }
+        per_ray = self.sampler.samples_per_ray
         stats = StepStats(
             losses["photometric"].detach(),
             len(rays),
-            len(samples),
+            len(samples) if per_ray is None else round(per_ray * len(rays)),
             output.opacity.detach(),
             squared_errors.detach(),
             samples.complete,
@@ -155,8 +156,6 @@ class NeRF3D(System):
 
     def adapt_num_rays(self) -> None:
         """Adapts the number of rays per step to the samples that the last step drew."""
-        if not self.stats.is_sample_count_exact:
-            return
         drawn = self.stats.samples
         if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt in the same way
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))

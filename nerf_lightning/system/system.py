@@ -37,6 +37,7 @@ class StepStats:
     rays: int
     """Rays, or pixels in 2D."""
     samples: int
+    """Samples drawn; where they are not counted, as many per ray as at the last count."""
     opacity: Float[Tensor, "R"] | None = None
     """Opacity of each ray, on the device: 0 is empty, 1 is opaque."""
     squared_errors: Float[Tensor, "R"] | None = None
@@ -45,11 +46,6 @@ class StepStats:
     """Rays that have all their samples; None for all."""
     losses: Mapping[str, Tensor] = field(default_factory=dict)
     """Terms of the loss by name, on the device."""
-
-    @property
-    def is_sample_count_exact(self) -> bool:
-        """True if `samples` is exact; False if it is the buffer capacity."""
-        return self.complete_rays is None
 
 
 @dataclass(frozen=True)

@@ -49,9 +49,9 @@ def check_processes(trainer: L.Trainer) -> None:
 def warm_up(system: System, data: DataModule, device: torch.device) -> None:
     """Runs a small step on a copy, so that kernels are compiled before the clock starts.
 
-    CPU kernels are compiled once and cached; with `compile`, in every process.
+    CPU and GPU kernels are compiled once and cached; with `compile`, in every process.
     """
-    is_compiled = device.type == "cpu" or system.compile_backend is not None
+    is_compiled = device.type in ("cpu", "cuda") or system.compile_backend is not None
     note = " (compiled on first use: half a minute)" if is_compiled else ""
     console = Console()
     with console.status(f"preparing kernels{note}") if is_interactive(console) else nullcontext():

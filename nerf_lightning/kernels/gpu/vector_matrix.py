@@ -1,0 +1,128 @@
+"""Vector-matrix decomposition: a row per position and a column per channel, so that a corner's channels are read at once."""
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from nerf_lightning.kernels.gpu.launch import kernel
+
+BLOCK = 32
+"""Positions per program."""
+
+
+@triton.jit
+def locate(position, side):
+    """Vertex below a position along an axis, and the fraction above it. NaN falls at an arbitrary vertex and stays NaN."""
+    clamped = tl.maximum(position, 0.0, propagate_nan=tl.PropagateNan.ALL)
+    scaled = tl.minimum(clamped, 1.0, propagate_nan=tl.PropagateNan.ALL) * (side - 1).to(tl.float32)
+    low = tl.minimum(tl.where(scaled == scaled, scaled, 0.0).to(tl.int32), side - 2)
+    return low, scaled - low.to(tl.float32)
+
+
+@triton.jit
+def order_axes(mode: tl.constexpr, x, y, z):
+    """First and second axis of a mode's plane, and the axis of its line."""
+    if mode == 0:
+        axes = y, z, x
+    elif mode == 1:
+        axes = x, z, y
+    else:
+        axes = x, y, z
+    return axes
+
+
+@triton.jit
+def interpolate(planes, lines, mode: tl.constexpr, x, y, z, side, channels, is_position, C: tl.constexpr):
+    """A mode's plane and line [B, C] at positions, their lowest corner and vertex, and the fractions above these."""
+    first, second, along = order_axes(mode, x, y, z)
+    row, wr = locate(first, side)
+    column, wc = locate(second, side)
+    low, wl = locate(along, side)
+    channel = tl.arange(0, C)[None, :]
+    mask = is_position[:, None] & (channel < channels)
+    corner = (mode * side + row) * side + column
+    vertex = mode * side + low
+    p = planes + (corner * channels)[:, None] + channel
+    q = lines + (vertex * channels)[:, None] + channel
+    wr, wc, wl = wr[:, None], wc[:, None], wl[:, None]
+    upper = (1 - wc) * tl.load(p, mask, 0.0) + wc * tl.load(p + channels, mask, 0.0)
+    lower = (1 - wc) * tl.load(p + side * channels, mask, 0.0) + wc * tl.load(p + (side + 1) * channels, mask, 0.0)
+    line = (1 - wl) * tl.load(q, mask, 0.0) + wl * tl.load(q + channels, mask, 0.0)
+    return (1 - wr) * upper + wr * lower, line, corner, vertex, wr, wc, wl
+
+
+@kernel()
+def multiply(
+    planes, lines, unit, out, positions, side, channels, IS_SUM: tl.constexpr, C: tl.constexpr, B: tl.constexpr
+):
+    """Products of planes and lines [N, 3, channels], or their sum [N]."""
+    i = tl.program_id(0) * B + tl.arange(0, B)
+    is_position = i < positions
+    x, y = tl.load(unit + i, is_position, 0.0), tl.load(unit + positions + i, is_position, 0.0)
+    z = tl.load(unit + 2 * positions + i, is_position, 0.0)
+    channel = tl.arange(0, C)[None, :]
+    mask = is_position[:, None] & (channel < channels)
+    total = tl.zeros([B, C], tl.float32)
+    for mode in tl.static_range(3):
+        plane, line, _, _, _, _, _ = interpolate(planes, lines, mode, x, y, z, side, channels, is_position, C)
+        if IS_SUM:
+            total += plane * line
+        else:
+            tl.store(out + (i[:, None] * 3 + mode) * channels + channel, plane * line, mask)
+    if IS_SUM:
+        tl.store(out + i, tl.sum(total, axis=1), is_position)
+
+
+@kernel()
+def scatter(
+    planes, lines, unit, grad, grad_planes, grad_lines, positions, side, channels,
+    IS_SUM: tl.constexpr, C: tl.constexpr, B: tl.constexpr,
+):  # fmt: skip
+    """Adds the gradient of `multiply` to that of planes and lines."""
+    i = tl.program_id(0) * B + tl.arange(0, B)
+    is_position = i < positions
+    x, y = tl.load(unit + i, is_position, 0.0), tl.load(unit + positions + i, is_position, 0.0)
+    z = tl.load(unit + 2 * positions + i, is_position, 0.0)
+    channel = tl.arange(0, C)[None, :]
+    mask = is_position[:, None] & (channel < channels)
+    for mode in tl.static_range(3):
+        plane, line, corner, vertex, wr, wc, wl = interpolate(
+            planes, lines, mode, x, y, z, side, channels, is_position, C
+        )
+        if IS_SUM:
+            above = tl.load(grad + i, is_position, 0.0)[:, None] + tl.zeros([B, C], tl.float32)
+        else:
+            above = tl.load(grad + (i[:, None] * 3 + mode) * channels + channel, mask, 0.0)
+        p = grad_planes + (corner * channels)[:, None] + channel
+        q = grad_lines + (vertex * channels)[:, None] + channel
+        to_plane, to_line = above * line, above * plane
+        tl.atomic_add(p, to_plane * (1 - wr) * (1 - wc), mask, sem="relaxed")
+        tl.atomic_add(p + channels, to_plane * (1 - wr) * wc, mask, sem="relaxed")
+        tl.atomic_add(p + side * channels, to_plane * wr * (1 - wc), mask, sem="relaxed")
+        tl.atomic_add(p + (side + 1) * channels, to_plane * wr * wc, mask, sem="relaxed")
+        tl.atomic_add(q, to_line * (1 - wl), mask, sem="relaxed")
+        tl.atomic_add(q + channels, to_line * wl, mask, sem="relaxed")
+
+
+class PlaneLine(torch.autograd.Function):
+    """`kernels.plane_line_products` or, if summed, `kernels.plane_line_sum`."""
+
+    @staticmethod
+    def forward(ctx, planes: Tensor, lines: Tensor, unit: Tensor, is_sum: bool) -> Tensor:
+        _, side, channels = lines.shape
+        planes, lines, coords = planes.contiguous(), lines.contiguous(), unit.T.contiguous()
+        out = unit.new_empty(len(unit)) if is_sum else unit.new_empty(len(unit), 3 * channels)
+        ctx.shape = len(unit), side, channels
+        ctx.constants = {"IS_SUM": is_sum, "C": triton.next_power_of_2(channels), "B": BLOCK}
+        multiply((triton.cdiv(len(unit), BLOCK),), planes, lines, coords, out, *ctx.shape, **ctx.constants)
+        ctx.save_for_backward(planes, lines, coords)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        planes, lines, coords = ctx.saved_tensors
+        gradients = torch.zeros_like(planes), torch.zeros_like(lines)
+        grid = (triton.cdiv(coords.shape[1], BLOCK),)
+        scatter(grid, planes, lines, coords, grad.contiguous(), *gradients, *ctx.shape, **ctx.constants)
+        return *gradients, None, None

@@ -1,0 +1,118 @@
+"""Calls of all GPU kernels: empty rays, NaN, full buffers, colliding entries."""
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any
+
+import torch
+from torch.nn.functional import normalize
+
+from nerf_lightning import kernels
+from nerf_lightning.cameras import Bounds, Rays
+from nerf_lightning.model.hashgrid import cubic_cells, table_sizes
+from tests.helpers.ragged_samples import make_ragged_samples
+
+Call = tuple[Callable[..., Any], list[torch.Tensor], tuple[int, ...]]
+"""A function of tensors, its inputs, and the numbers of those that take no gradient."""
+
+RAY_COUNTS = [5, 0, 40, 0, 0, 1, 33]
+"""Samples of each ray: none, fewer and more than a program takes at a time."""
+
+
+def march_through_ball(resolution: int, num_rays: int, samples: int, capacity: int | None) -> Call:
+    origins = 4 * normalize(torch.randn(num_rays, 3), dim=1)
+    directions = normalize(0.9 * torch.randn(num_rays, 3) - origins, dim=1)  # some rays miss the box
+    bounds = Bounds(torch.tensor([[-1.0, -1.1, -0.9], [1, 1.05, 1]]))
+    axis = (torch.arange(resolution) + 0.5) / (resolution / 2) - 1
+    ball = axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2 < 0.5
+    near, far = bounds.near_far(Rays(origins, directions))
+    far[1] = math.nan
+
+    def call(origins: Any, directions: Any, near: Any, far: Any, shift: Any, occupied: Any) -> Any:
+        rays, step = Rays(origins, directions), 4.0 / samples
+        t, dt, ray, offsets = kernels.march(rays, bounds, near, far, shift, occupied, samples, step, capacity)
+        return [t * (dt > 0), dt, ray * (dt > 0), offsets]
+
+    occupied = (ball & (torch.rand(ball.shape) < 0.7)).flatten()
+    return call, [origins, directions, near, far, torch.rand(num_rays), occupied], tuple(range(6))
+
+
+def filter_samples(capacity: int | None, max_dropped: float, early_stop_eps: float) -> Call:
+    samples = make_ragged_samples(RAY_COUNTS)
+    depth = 2 * torch.rand(len(samples)) ** 4
+    depth[-10] = math.nan  # on the last ray: the reference's sums carry it on to later rays
+
+    def call(depth: Any, t: Any, dt: Any, ray: Any, offsets: Any) -> Any:
+        limits = early_stop_eps, torch.tensor(0.02), capacity, max_dropped
+        depths, (t, dt, ray, offsets) = kernels.filter_visible(depth, (t, dt, ray, offsets), *limits)
+        return [depths, t * (dt > 0), dt, ray * (dt > 0), offsets]
+
+    return call, [depth, samples.t, samples.dt, samples.ray, samples.offsets], tuple(range(5))
+
+
+def composite_samples(density_scale: float, has_nan: bool = False) -> Call:
+    samples = make_ragged_samples(RAY_COUNTS)
+    density, rgb = density_scale * torch.rand(len(samples)) ** 3, torch.rand(len(samples), 3)
+    if has_nan:
+        density[-10] = math.nan
+    inputs = [density, rgb, samples.t, samples.dt, samples.ray, samples.offsets]
+    # The reference's gradient carries NaN on to other rays.
+    return kernels.composite, inputs, (0, 1, 2, 3) if has_nan else (2, 3)
+
+
+def encode_positions(levels: int, log2_size: int, features: int, max_resolution: int, count: int) -> Call:
+    cells = cubic_cells(levels, 4, max_resolution)
+    sizes = table_sizes(cells, 2**log2_size)
+    unit = torch.rand(count, 3) * 1.1 - 0.05  # some are clamped
+    unit[0, 1] = math.nan
+    unit[1:5] = torch.tensor([1.0, 0, 1])  # on vertices, and all of them in the same entries
+    tables = torch.randn(sum(sizes), features)
+    return lambda tables, unit: kernels.hash_interpolate(tables, unit, cells, sizes), [tables, unit], ()
+
+
+def multiply_planes(function: Callable[..., Any], side: int, channels: int, count: int) -> Call:
+    unit = torch.rand(count, 3) * 1.1 - 0.05
+    unit[0, 1] = math.nan
+    unit[1:5] = torch.tensor([1.0, 0, 1])
+    volume = torch.randn(3, side, side, channels), torch.randn(3, side, channels)
+    return lambda planes, lines: function(planes, lines, unit), list(volume), ()
+
+
+def run_network(widths: list[int], num_extra: int, num_head: int, count: int) -> Call:
+    parameters = [torch.randn(shape) for i, o in pairwise(widths) for shape in ((o, i), (o,))]
+    x = torch.randn(count, widths[0] - num_extra)
+    x[1, 0] = math.nan
+
+    def call(x: Any, extra: Any, *parameters: Any) -> Any:
+        layers = list(zip(parameters[::2], parameters[1::2], strict=True))
+        return kernels.mlp_heads(x, layers, num_head, extra if num_extra else None)
+
+    return call, [x, torch.randn(count, num_extra), *parameters], (1,)
+
+
+def list_calls() -> dict[str, Call]:
+    """All calls by name."""
+    torch.manual_seed(3)
+    return {
+        "march, exact count": march_through_ball(8, 13, 40, None),
+        "march, buffer with space": march_through_ball(32, 7, 150, 2000),
+        "march, full buffer": march_through_ball(16, 10, 60, 20),
+        "filter_visible, exact count": filter_samples(None, math.inf, 1e-2),
+        "filter_visible, buffer with space": filter_samples(90, 0.05, 0.3),
+        "filter_visible, full buffer": filter_samples(20, math.inf, 1e-4),
+        "composite, thin": composite_samples(1.0),
+        "composite, opaque": composite_samples(300.0),
+        "composite, empty": composite_samples(0.0),
+        "composite, NaN": composite_samples(1.0, has_nan=True),
+        "hash_interpolate": encode_positions(4, 10, 2, 40, 150),
+        "hash_interpolate, many features": encode_positions(2, 8, 4, 20, 40),
+        "hash_interpolate, one feature": encode_positions(3, 6, 1, 64, 129),
+        "plane_line_products": multiply_planes(kernels.plane_line_products, 12, 16, 40),
+        "plane_line_products, odd channels": multiply_planes(kernels.plane_line_products, 5, 3, 33),
+        "plane_line_sum": multiply_planes(kernels.plane_line_sum, 20, 8, 64),
+        "mlp, one hidden layer": run_network([16, 64, 16], 0, 1, 70),
+        "mlp, two hidden layers": run_network([31, 64, 64, 3], 16, 0, 100),
+        "mlp, odd widths": run_network([60, 24, 3], 12, 2, 5),
+        "plane_line_sum, two vertices": multiply_planes(kernels.plane_line_sum, 2, 1, 20),
+    }
