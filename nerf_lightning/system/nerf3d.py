@@ -22,6 +22,8 @@ from nerf_lightning.system.system import OptimizerFactory, Schedule, StepStats, 
 from nerf_lightning.system.torch_compile import maybe_compile
 from nerf_lightning.utils.seeding import Stream, step_generator
 
+ADAPT_EVERY = 16
+"""Steps between adaptations of the number of rays on several devices, each of which has to wait for the others' counts."""
 SAMPLE_CHUNKS_PER_PASS = 16
 """Samples drawn at once without gradient, in multiples of `chunk`."""
 
@@ -157,6 +159,8 @@ class NeRF3D(System):
     def adapt_num_rays(self) -> None:
         """Adapts the number of rays per step to the samples that the last step drew."""
         drawn = self.stats.samples
+        if self.trainer.world_size > 1 and self.stats.complete_rays is not None and self.global_step % ADAPT_EVERY:
+            return
         if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt in the same way
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))
         self.datamodule.adapt_num_rays(drawn)
