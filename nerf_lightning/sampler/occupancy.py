@@ -126,7 +126,8 @@ class OccupancySampler(Sampler):
 
     @property
     def samples_per_ray(self) -> float | None:
-        return self.capacity.per_ray.get(False, (0.0, None))[1]
+        counts = self.capacity.per_ray.get(False)
+        return None if counts is None else counts[1]
 
     @property
     def samples(self) -> int:

@@ -159,9 +159,9 @@ class NeRF3D(System):
     def adapt_num_rays(self) -> None:
         """Adapts the number of rays per step to the samples that the last step drew."""
         drawn = self.stats.samples
-        if self.trainer.world_size > 1 and self.stats.complete_rays is not None and self.global_step % ADAPT_EVERY:
-            return
         if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt in the same way
+            if self.stats.complete_rays is not None and self.global_step % ADAPT_EVERY:
+                return
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))
         self.datamodule.adapt_num_rays(drawn)
 

@@ -12,6 +12,15 @@ RAYS_PER_PROGRAM, STEPS_PER_BLOCK = 4, 128
 
 
 @triton.jit
+def load_rays(near, far, shift, rays, R: tl.constexpr):
+    """This program's rays [R] and [R, 1], which of them exist, and their near, far and shift."""
+    row = tl.program_id(0) * R + tl.arange(0, R)
+    ray, is_ray = row[:, None], (row < rays)[:, None]
+    ray_near, ray_far = tl.load(near + ray, is_ray, 0.0), tl.load(far + ray, is_ray, 0.0)
+    return row, ray, is_ray, ray_near, ray_far, tl.load(shift + ray, is_ray, 0.0)
+
+
+@triton.jit
 def intersect_steps(
     origins, directions, near, far, shift, center, half_size, occupied, s, samples, step, resolution, ray, is_ray
 ):
@@ -23,9 +32,8 @@ def intersect_steps(
     t = tl.where(is_inside, (start + end) * 0.5, 0.0)
     cell = tl.zeros(t.shape, tl.int32)
     for axis in tl.static_range(3):
-        position = t * tl.load(directions + 3 * ray + axis, is_ray, 0.0) + tl.load(
-            origins + 3 * ray + axis, is_ray, 0.0
-        )
+        direction = tl.load(directions + 3 * ray + axis, is_ray, 0.0)
+        position = t * direction + tl.load(origins + 3 * ray + axis, is_ray, 0.0)
         half = tl.load(half_size + axis) + tl.zeros_like(position)
         unit = tl.div_rn(position - (tl.load(center + axis) - half), 2 * half)
         index = tl.minimum(tl.maximum((unit * resolution).to(tl.int32), 0), resolution - 1)
@@ -39,29 +47,14 @@ def count_steps(
     R: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
     """Writes the steps of each ray in occupied cells, from the second entry on."""
-    row = tl.program_id(0) * R + tl.arange(0, R)
-    ray, is_ray = row[:, None], (row < rays)[:, None]
-    ray_near, ray_far = tl.load(near + ray, is_ray, 0.0), tl.load(far + ray, is_ray, 0.0)
-    ray_shift = tl.load(shift + ray, is_ray, 0.0)
+    row, ray, is_ray, ray_near, ray_far, ray_shift = load_rays(near, far, shift, rays, R)
     total = tl.zeros([R], tl.int64)
     for first in range(0, samples + 1, S):
         s = first + tl.arange(0, S)[None, :]
         _, _, keep = intersect_steps(
-            origins,
-            directions,
-            ray_near,
-            ray_far,
-            ray_shift,
-            center,
-            half_size,
-            occupied,
-            s,
-            samples,
-            step,
-            resolution,
-            ray,
-            is_ray,
-        )
+            origins, directions, ray_near, ray_far, ray_shift, center, half_size, occupied, s, samples, step,
+            resolution, ray, is_ray,
+        )  # fmt: skip
         total += tl.sum(keep.to(tl.int64), axis=1)
     tl.store(counts + 1 + row, total, row < rays)
 
@@ -87,29 +80,14 @@ def write_steps(
     R: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
     """Packs the steps in occupied cells, as far as they fit."""
-    row = tl.program_id(0) * R + tl.arange(0, R)
-    ray, is_ray = row[:, None], (row < rays)[:, None]
-    ray_near, ray_far = tl.load(near + ray, is_ray, 0.0), tl.load(far + ray, is_ray, 0.0)
-    ray_shift = tl.load(shift + ray, is_ray, 0.0)
+    row, ray, is_ray, ray_near, ray_far, ray_shift = load_rays(near, far, shift, rays, R)
     next_slot = tl.load(offsets + row, row < rays, 0).to(tl.int32)
     for first in range(0, samples + 1, S):
         s = first + tl.arange(0, S)[None, :]
         t, dt, keep = intersect_steps(
-            origins,
-            directions,
-            ray_near,
-            ray_far,
-            ray_shift,
-            center,
-            half_size,
-            occupied,
-            s,
-            samples,
-            step,
-            resolution,
-            ray,
-            is_ray,
-        )
+            origins, directions, ray_near, ray_far, ray_shift, center, half_size, occupied, s, samples, step,
+            resolution, ray, is_ray,
+        )  # fmt: skip
         count = keep.to(tl.int32)
         slot = next_slot[:, None] + tl.cumsum(count, axis=1) - count
         fits = keep & (slot < capacity)

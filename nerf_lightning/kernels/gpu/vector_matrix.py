@@ -5,19 +5,11 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
+from nerf_lightning.kernels.gpu.hashgrid import locate_cell
 from nerf_lightning.kernels.gpu.launch import kernel
 
 BLOCK = 32
 """Positions per program."""
-
-
-@triton.jit
-def locate(position, side):
-    """Vertex below a position along an axis, and the fraction above it. NaN falls at an arbitrary vertex and stays NaN."""
-    clamped = tl.maximum(position, 0.0, propagate_nan=tl.PropagateNan.ALL)
-    scaled = tl.minimum(clamped, 1.0, propagate_nan=tl.PropagateNan.ALL) * (side - 1).to(tl.float32)
-    low = tl.minimum(tl.where(scaled == scaled, scaled, 0.0).to(tl.int32), side - 2)
-    return low, scaled - low.to(tl.float32)
 
 
 @triton.jit
@@ -36,9 +28,9 @@ def order_axes(mode: tl.constexpr, x, y, z):
 def interpolate(planes, lines, mode: tl.constexpr, x, y, z, side, channels, is_position, C: tl.constexpr):
     """A mode's plane and line [B, C] at positions, their lowest corner and vertex, and the fractions above these."""
     first, second, along = order_axes(mode, x, y, z)
-    row, wr = locate(first, side)
-    column, wc = locate(second, side)
-    low, wl = locate(along, side)
+    row, wr = locate_cell(first, side - 1)
+    column, wc = locate_cell(second, side - 1)
+    low, wl = locate_cell(along, side - 1)
     channel = tl.arange(0, C)[None, :]
     mask = is_position[:, None] & (channel < channels)
     corner = (mode * side + row) * side + column
