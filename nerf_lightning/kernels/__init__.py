@@ -4,12 +4,12 @@
 """
 
 from nerf_lightning.kernels.backend import has_fast_kernel, set_kernels
-from nerf_lightning.kernels.composite import composite, filter_visible, volume_weights
+from nerf_lightning.kernels.composite import composite, filter_visible, median_depth, volume_weights
 from nerf_lightning.kernels.harmonics import spherical_harmonics
 from nerf_lightning.kernels.hashgrid import hash_interpolate
 from nerf_lightning.kernels.march import cell_index, march, mark_cells, pack_intervals, ray_positions
 from nerf_lightning.kernels.march_until_opaque import march_until_opaque
-from nerf_lightning.kernels.merge import merge_low_weight
+from nerf_lightning.kernels.merge import average_neighbors, merge_low_weight
 from nerf_lightning.kernels.mlp import mlp, mlp_heads
 from nerf_lightning.kernels.resampling import interval_midpoints, invert_cdf, resample
 from nerf_lightning.kernels.vector_matrix import plane_line_products, plane_line_sum, plane_line_sum_and_products
@@ -23,6 +23,8 @@ from nerf_lightning.kernels.voxels import (
 )
 
 __all__ = [
+    "average_neighbors",
+    "median_depth",
     "interval_midpoints",
     "cell_index",
     "composite",

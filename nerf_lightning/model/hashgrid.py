@@ -116,6 +116,7 @@ class HashGridField(Field):
     GEOMETRY_FEATURES = 15  # passed from the density to the color network, Instant-NGP section 5.4
     INIT_LOG_DENSITY = -1.0  # an exponential density starts as thin fog
     max_lr = 0.1
+    cpu_chunks = 4  # loads each level's table into the core's cache less often
 
     def __init__(
         self,
@@ -164,9 +165,16 @@ class HashGridField(Field):
         raw, geometry = mlp_heads(encoded, layer_parameters(self.density_net), 1)
         return self.activation(raw.squeeze(1)), geometry
 
+    def view_logits(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Color logits of the color network: the view residual, or the whole color."""
+        return mlp(features, layer_parameters(self.color_net), encode_directions(directions, self.terms))
+
+    def shade(self, features: Float[Tensor, "N F"], logits: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Features and `view_logits` -> rgb in [0, 1]."""
+        return torch.sigmoid(features[:, :3] + logits if self.view_residual else logits)
+
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
         density, features = self.features(positions)
-        logits = mlp(features, layer_parameters(self.color_net), encode_directions(directions, self.terms))
-        if not self.view_residual:
-            return FieldOutput(density / self.unit_length, torch.sigmoid(logits))
-        return FieldOutput(density / self.unit_length, torch.sigmoid(features[:, :3] + logits), logits)
+        logits = self.view_logits(features, directions)
+        rgb = self.shade(features, logits)
+        return FieldOutput(density / self.unit_length, rgb, logits if self.view_residual else None)
