@@ -19,12 +19,13 @@ from nerf_lightning.callbacks.evaluation import get_peak_memory_bytes
 from nerf_lightning.config.build import build_data, build_system, get_metadata
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.config.limits import get_limits
-from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.dataset import RayDataModule, Views
+from nerf_lightning.dataset.ray_datamodule import STEPS_PER_DRAW
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.system.growth import compute_next_stage, sync_resolution_scale, upsample_field
 from nerf_lightning.system.system import sum_losses
 from nerf_lightning.training.process import prepare_process
-from nerf_lightning.utils.device import synchronize
+from nerf_lightning.utils.device import CPU, synchronize
 from nerf_lightning.utils.libraries import silence_lightning
 from nerf_lightning.utils.seeding import Stream, step_generator
 
@@ -39,9 +40,11 @@ PROFILE_ROWS, MAX_NAME_LENGTH = 15, 70
 
 @dataclass
 class Training:
-    """A 3D run that trains step by step, without Lightning."""
+    """A 3D run that trains step by step, without Lightning and CUDA graphs."""
 
     data: RayDataModule
+    photos: Views
+    """Copy of the data's photos on the device."""
     system: NeRF3D
     optimizer: torch.optim.Optimizer
     period: int
@@ -59,7 +62,7 @@ class Training:
         system.set_learning_rates(self.optimizer, number)
         if (stage := compute_next_stage(system, number)) is not None:
             upsample_field(system, data, stage, self.optimizer)
-        batch = data.draw(number).to(system.device)
+        batch = data.draw_batch(self.photos, number, slice(None))
         generator = step_generator(system.seed, Stream.STEP, number, system.device)
         self.optimizer.zero_grad()
         system.sampler.update(number, system.field.density, generator)
@@ -68,10 +71,18 @@ class Training:
         self.optimizer.step()
         assert system.stats.squared_errors is not None
         data.update_error_map(system.stats.squared_errors, system.stats.complete_rays)
-        data.adapt_num_rays(system.stats.samples)
+        self.adapt_num_rays(number)
         synchronize(system.device)
         self.next_step += 1
         return time.perf_counter() - start
+
+    def adapt_num_rays(self, number: int) -> None:
+        """As `NeRF3D.adapt_num_rays`, after a step."""
+        steps = 1 if self.system.device == CPU else STEPS_PER_DRAW
+        if (number + 1) % steps == 0:
+            self.system.sampler.read_counts()
+            per_ray, stats = self.system.sampler.samples_per_ray, self.system.stats
+            self.data.adapt_num_rays(stats.samples if per_ray is None else round(per_ray * stats.rays), steps)
 
 
 def start_training(overrides: list[str], device: torch.device, steps: int = WARMUP_STEPS) -> Training:
@@ -91,7 +102,7 @@ def start_training(overrides: list[str], device: torch.device, steps: int = WARM
     system.sampler.mark_invisible_cells(data.scene.train.cameras)
     period = int(cfg.sampler.get("update_every", DEFAULT_PERIOD))
     growth_steps = -(-steps // period) * period
-    training = Training(data, system, system.configure_optimizers(), period, growth_steps)
+    training = Training(data, data.photos.to(device), system, system.configure_optimizers(), period, growth_steps)
     for _ in range(growth_steps):
         training.step()
     return training

@@ -169,7 +169,7 @@ def test_training_step_with_gpu_kernels_moves_few_bytes(recipe: str, device: tor
     options = [f"recipe={recipe}", *given, *small, f"dataset.rays={rays}", "limits.chunk_samples=524288"]
     system, data = build_system_and_data(options, tmp_path)
     system.to(device).sampler.capacity.per_ray = {False: tuple(count / rays for count in counts)}
-    training = Training(data, system, system.configure_optimizers(), 16, 1, next_step=1)
+    training = Training(data, data.photos.to(device), system, system.configure_optimizers(), 16, 1, next_step=1)
     monkeypatch.setattr(gpu.launch, "run_kernel", lambda *arguments: None)
     set_kernels("triton")
     with ZeroMemory():
@@ -177,6 +177,21 @@ def test_training_step_with_gpu_kernels_moves_few_bytes(recipe: str, device: tor
         with OpCounter() as count:
             training.step()
     assert count.bytes <= max_bytes, count.bytes_by_name.most_common(5)
+
+
+def test_rays_of_sixteen_steps_are_drawn_together(device: torch.device, tmp_path: Path):
+    _, data = build_system_and_data(small_options("hashgrid"), tmp_path)
+    views = data.photos.to(device)
+    data.draw_batch(views, 0, slice(None))
+    with OpCounter() as count:
+        batches = [data.draw_batch(views, step, slice(None)) for step in range(16, 32)]
+    assert count.operations <= 64 and count.waits == 0, count.names.most_common()
+    assert len({tuple(batch.rays.directions[0].tolist()) for batch in batches}) == 16
+    data.update_error_map(torch.ones(data.rays).to(device))
+    _, resumed = build_system_and_data(small_options("hashgrid"), tmp_path)
+    resumed.load_state_dict(data.state_dict())
+    pixels = [x.draw_batch(views, 21, slice(1, None, 2)).pixels.cpu() for x in (resumed, resumed)]
+    assert torch.equal(pixels[0], batches[5].pixels.cpu()[1::2]) and torch.equal(*pixels)
 
 
 @pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])
