@@ -50,7 +50,7 @@ class Extent:
 QUICK = Extent(24, 24, 10, (0.2,), (0.2,), 1, 1, ("dataset.samples=512", "dataset.rays=64"))
 
 
-def prepare_scenes(paths: list[Path], output: Path, extent: Extent) -> dict[str, Path]:
+def prepare_scenes(paths: list[Path], folder: Path, extent: Extent) -> dict[str, Path]:
     """Returns the scene of each experiment: a given one, or else a built-in one, written to a file."""
     scenes = {CAPTURE if nl.load_scene(path).bounds.unbounded else OBJECT: path for path in paths}
     room = partial(make_room_scene, ROOMS["filling subject"], 0)
@@ -58,7 +58,7 @@ def prepare_scenes(paths: list[Path], output: Path, extent: Extent) -> dict[str,
     for experiment, name, build, size in built_in:
         if experiment not in scenes:
             print(f"device: rendering the {name}", flush=True)
-            scenes[experiment] = output / f"{name}.npz"
+            scenes[experiment] = folder / f"{name}.npz"
             save_npz(build(size, extent.views, max(2, extent.views // 10)), scenes[experiment])
     return scenes
 
@@ -95,12 +95,14 @@ def train_recipe(experiment: str, options: list[str], recipe: str, seconds: floa
 def list_stages(args: argparse.Namespace, extent: Extent) -> Iterator[tuple[Row, float, Callable[[], Rows]]]:
     """Yields the labels, estimated seconds and function of each stage."""
     yield {"table": "kernels"}, 0, partial(check_kernels, args.device)
-    scenes = prepare_scenes(args.scenes, args.output, extent)
+    folder = args.output / "device"
+    folder.mkdir(exist_ok=True)
+    scenes = prepare_scenes(args.scenes, folder, extent)
     recipes = args.recipes or (GPU_RECIPES if args.device.type == "cuda" else RECIPES)
     experiments = {recipe: CAPTURE if CAPTURE in recipe else OBJECT for recipe in recipes}
     options = {
         recipe: [f"dataset.path='{scenes[experiments[recipe]].resolve()}'", "dataset.resize=null", f"recipe={recipe}"]
-        + [f"device={args.device.type}", *extent.overrides, *args.overrides]
+        + [f"device={args.device.type}", "overwrite=true", *extent.overrides, *args.overrides]
         for recipe in recipes
     }
     for recipe, given in options.items():
@@ -108,7 +110,7 @@ def list_stages(args: argparse.Namespace, extent: Extent) -> Iterator[tuple[Row,
         yield {"table": "steps", "recipe": recipe}, RUN_SECONDS, stage
     budgets = {name: extent.capture_seconds if CAPTURE in name else extent.seconds for name in recipes}
     for seconds, recipe in sorted((seconds, name) for name, budget in budgets.items() for seconds in budget):
-        stage = partial(train_recipe, experiments[recipe], options[recipe], recipe, seconds, args.output)
+        stage = partial(train_recipe, experiments[recipe], options[recipe], recipe, seconds, folder)
         yield {"table": "trainings", "recipe": recipe, "seconds": seconds}, seconds + RUN_SECONDS, stage
 
 
