@@ -157,7 +157,8 @@ def interpolate_lanes(typing, table, unit, first, cells, factors, mask, out, fea
     element = ir.DoubleType() if pack == 2 else ir.FloatType()
     vector, packed = ir.VectorType(ir.FloatType(), width), ir.VectorType(ir.FloatType(), pack * width)
     whole, bits = ir.VectorType(ir.IntType(32), width), ir.VectorType(ir.IntType(1), width)
-    places, loaded = ir.VectorType(ir.PointerType(), width), ir.VectorType(element, width)
+    places, loaded = ir.VectorType(element.as_pointer(), width), ir.VectorType(element, width)
+    row = ir.ArrayType(element, len(features) // pack)
 
     def code(context, builder, signature, values):
         kinds, number = signature.args, ir.IntType(32)
@@ -165,16 +166,14 @@ def interpolate_lanes(typing, table, unit, first, cells, factors, mask, out, fea
         gather = cgutils.get_or_insert_function(
             builder.module, ir.FunctionType(loaded, [places, number, bits, loaded]), name
         )
-        base = context.make_array(kinds[0])(context, builder, values[0]).data
+        base = builder.bitcast(context.make_array(kinds[0])(context, builder, values[0]).data, row.as_pointer())
 
         def splat(value):
             empty = ir.Constant(ir.VectorType(value.type, width), ir.Undefined)
             return _shuffle(builder, builder.insert_element(empty, value, number(0)), empty, [0] * width)
 
         def entry(index, column):
-            place = builder.gep(
-                base, [index, number(column)], source_etype=ir.ArrayType(element, len(features) // pack)
-            )
+            place = builder.gep(base, [index, number(column)], source_etype=row)
             place.type = places  # llvmlite takes the scalar's
             arguments = place, number(4), ir.Constant(bits, [1] * width), ir.Constant(loaded, ir.Undefined)
             return builder.bitcast(builder.call(gather, arguments), packed)
@@ -209,8 +208,8 @@ def interpolate_lanes(typing, table, unit, first, cells, factors, mask, out, fea
             while len(terms) > 1:
                 terms = [builder.fadd(*pair) for pair in zip(terms[::2], terms[1::2], strict=True)]
             for part in range(pack):
-                row = ir.IntType(64)(pack * column + part)
-                where = (kinds[6], types.intp, kinds[2]), (values[6], row, values[2])
+                number_of_row = ir.IntType(64)(pack * column + part)
+                where = (kinds[6], types.intp, kinds[2]), (values[6], number_of_row, values[2])
                 value = _shuffle(builder, terms[0], terms[0], range(part, pack * width, pack))
                 builder.store(value, _pointer(context, builder, *where, width), align=4)
         return context.get_dummy_value()
