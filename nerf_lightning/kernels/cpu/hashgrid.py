@@ -71,7 +71,7 @@ def cells_of(resolutions, level, axes):
 
 @jit
 def interpolate_blocks(table, unit, first, last, cells, factors, out, features, hashed):
-    """Fills the leading columns of out[:, first:last], as many as there are whole vectors; returns the first of the rest."""
+    """Fills whole vectors of out[:, first:last]; returns the first of the columns that remain."""
     mask = int32(len(table) - 1)
     while first + len(LANES) <= last:
         interpolate_lanes(table, unit, first, cells, factors, mask, out, features, hashed, LANES)
