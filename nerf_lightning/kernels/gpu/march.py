@@ -18,7 +18,8 @@ BLOCK = 256
 @triton.jit
 def intersect_box(origins, directions, aabb, near, far, ray, is_ray):
     """`Bounds.near_far` of rays [R, 1]."""
-    for axis in tl.static_range(3):
+    near, far = near + tl.zeros(ray.shape, tl.float32), far + tl.zeros(ray.shape, tl.float32)
+    for axis in range(3):
         origin = tl.load(origins + 3 * ray + axis, is_ray, 0.0)
         direction = tl.load(directions + 3 * ray + axis, is_ray, 0.0)
         direction = tl.where(tl.abs(direction) < 1e-9, 1e-9, direction)
@@ -60,14 +61,20 @@ def pad_buffers(depth_out, t_out, dt_out, ray_out, offsets, rays, capacity, S: t
 
 @kernel()
 def march_rays(
-    origins, directions, shift, aabb, center, half_size, occupied, offsets, t_out, dt_out, ray_out,
+    origins, directions, shift, aabb, center, half_size, occupied, limits, offsets, t_out, dt_out, ray_out,
     rays, samples, step, resolution, capacity, min_near, max_far,
     WRITES: tl.constexpr, R: tl.constexpr, S: tl.constexpr,
 ):  # fmt: skip
-    """Packs the steps in occupied cells, as far as they fit; or counts each ray's, from the second of `offsets` on."""
+    """Packs the steps in occupied cells, as far as they fit; or counts each ray's, from the second of `offsets` on, and
+    writes its near and far limits."""
     row = tl.program_id(0) * R + tl.arange(0, R)
     ray, is_ray = row[:, None], (row < rays)[:, None]
-    near, far = intersect_box(origins, directions, aabb, min_near, max_far, ray, is_ray)
+    if WRITES:
+        near, far = tl.load(limits + ray, is_ray, 0.0), tl.load(limits + rays + ray, is_ray, 0.0)
+    else:
+        near, far = intersect_box(origins, directions, aabb, min_near, max_far, ray, is_ray)
+        tl.store(limits + ray, near, is_ray)
+        tl.store(limits + rays + ray, far, is_ray)
     ray_shift, next_slot = tl.load(shift + ray, is_ray, 0.0), tl.zeros([R], tl.int32)
     if WRITES:
         next_slot = tl.load(offsets + row, row < rays, 0).to(tl.int32)
@@ -104,17 +111,18 @@ def march(
     """`kernels.march` of a bounded scene."""
     count, resolution = len(rays), round(len(occupied) ** (1 / 3))
     box = bounds.aabb, bounds.center, bounds.half_size
-    inputs = *(x.contiguous() for x in (rays.origins, rays.directions, shift)), *box, occupied
-    limits = float(max(bounds.near or 0.0, 0.0)), math.inf if bounds.far is None else float(bounds.far)
+    limits = shift.new_empty(2, count)
+    inputs = *(x.contiguous() for x in (rays.origins, rays.directions, shift)), *box, occupied, limits
+    ends = float(max(bounds.near or 0.0, 0.0)), math.inf if bounds.far is None else float(bounds.far)
     grid, blocks = (max(triton.cdiv(count, RAYS_PER_PROGRAM), 1),), {"R": RAYS_PER_PROGRAM, "S": STEPS_PER_BLOCK}
     counts = torch.empty(count + 1, dtype=torch.int64, device=shift.device)
     shape = count, samples, step, resolution
-    march_rays(grid, *inputs, counts, shift, shift, counts, *shape, 0, *limits, WRITES=False, **blocks)
+    march_rays(grid, *inputs, counts, shift, shift, counts, *shape, 0, *ends, WRITES=False, **blocks)
     offsets = counts.cumsum(0)
     size = int(offsets[-1]) if capacity is None else capacity
     t, dt = shift.new_empty(2, size).unbind()
     ray = torch.empty(size, dtype=torch.int64, device=shift.device)
-    march_rays(grid, *inputs, offsets, t, dt, ray, *shape, size, *limits, WRITES=True, **blocks)
+    march_rays(grid, *inputs, offsets, t, dt, ray, *shape, size, *ends, WRITES=True, **blocks)
     return t, dt, ray, offsets
 
 

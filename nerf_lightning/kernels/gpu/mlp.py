@@ -82,20 +82,18 @@ def compute_hidden(
     x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO: tl.constexpr, IN: tl.constexpr,
     EX: tl.constexpr, HID: tl.constexpr,
 ):  # fmt: skip
-    """Blocks of both inputs (the first stands for missing extra ones) and hidden layers [B, HID]; one stands for both."""
+    """Hidden layers [B, HID]; with one, it stands for both."""
     width, block = inputs + extras, load_block(x, i, is_input, inputs, IN)
     first = tl.dot(block, load_transposed(w1, 0, inputs, width, hidden, IN, HID), input_precision="tf32")
-    extra_block = block
     if EX > 0:
-        extra_block = load_block(extra, i, is_input, extras, EX)
         columns = load_transposed(w1, inputs, extras, width, hidden, EX, HID)
-        first += tl.dot(extra_block, columns, input_precision="tf32")
+        first += tl.dot(load_block(extra, i, is_input, extras, EX), columns, input_precision="tf32")
     first = relu(first + load_bias(b1, hidden, HID))
     second = first
     if TWO:
         second = tl.dot(first, load_transposed(w2, 0, hidden, hidden, hidden, HID, HID), input_precision="tf32")
         second = relu(second + load_bias(b2, hidden, HID))
-    return block, extra_block, first, second
+    return first, second
 
 
 @kernel(num_warps=8)
@@ -107,7 +105,7 @@ def propagate(
     """Head and further outputs of a network with the hidden layers 1 and, if TWO, 2; layer 3 is the last."""
     i = tl.program_id(0) * B + tl.arange(0, B)
     is_input = i < count
-    _, _, _, h = compute_hidden(x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID)
+    _, h = compute_hidden(x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID)
     y = tl.dot(h, load_transposed(w3, 0, hidden, hidden, outputs, HID, OUT), input_precision="tf32")
     y += load_bias(b3, outputs, OUT)
     pointers, is_rest = point_at_rest(rest, i, is_input, heads, outputs, OUT)
@@ -130,6 +128,7 @@ def add_gradients(
     tl.atomic_add(grad_weight + o[:, None] * width + first + i, product, is_entry, sem="relaxed")
     if grad_bias is not None:
         tl.atomic_add(grad_bias + o, tl.sum(above, axis=0), o < outputs, sem="relaxed")
+    tl.debug_barrier()  # else the compiler loads what comes next too early, and spills registers
 
 
 @kernel(num_warps=8)
@@ -142,9 +141,7 @@ def differentiate(
     """Gradients of inputs, and those of all parameters, added up."""
     i = tl.program_id(0) * B + tl.arange(0, B)
     is_input = i < count
-    block, extra_block, first, second = compute_hidden(
-        x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID
-    )
+    first, second = compute_hidden(x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID)
     above, value = load_block(grad_head, i, is_input, heads, OUT), load_block(head, i, is_input, heads, OUT)
     if ACTIVATION == "exp":
         above *= exp_slope(value, scale)
@@ -161,9 +158,11 @@ def differentiate(
         middle = tl.trans(load_transposed(w2, 0, hidden, hidden, hidden, HID, HID))
         above = tl.where(first <= 0, 0.0, tl.dot(above, middle, input_precision="tf32"))
     above = tl.where(is_input[:, None], above, 0.0)
+    block = load_block(x, i, is_input, inputs, IN)  # once more: it would occupy registers all along
     add_gradients(g_w1, g_b1, above, block, 0, inputs, inputs + extras, hidden, IN, HID)
     if EX > 0:
-        add_gradients(g_w1, None, above, extra_block, inputs, extras, inputs + extras, hidden, EX, HID)
+        block = load_block(extra, i, is_input, extras, EX)
+        add_gradients(g_w1, None, above, block, inputs, extras, inputs + extras, hidden, EX, HID)
     matrix = tl.trans(load_transposed(w1, 0, inputs, inputs + extras, hidden, IN, HID))
     store_block(grad_x, tl.dot(above, matrix, input_precision="tf32"), i, is_input, inputs, IN)
 
