@@ -134,6 +134,21 @@ def test_training_step_on_device_needs_few_operations_and_no_wait(name: str, dev
     assert sum(count.waits for count in counts[-period:]) == 1, "to read the sample counts"
 
 
+def test_rays_of_sixteen_steps_are_drawn_together(device: torch.device, tmp_path: Path):
+    _, data = build_system_and_data(small_options("hashgrid"), tmp_path)
+    views = data.photos.to(device)
+    data.draw_batch(views, 0, slice(None))
+    with OpCounter() as count:
+        batches = [data.draw_batch(views, step, slice(None)) for step in range(16, 32)]
+    assert count.operations <= 64 and count.waits == 0, count.names.most_common()
+    assert len({tuple(batch.rays.directions[0].tolist()) for batch in batches}) == 16
+    data.update_error_map(torch.ones(data.rays).to(device))
+    _, resumed = build_system_and_data(small_options("hashgrid"), tmp_path)
+    resumed.load_state_dict(data.state_dict())
+    pixels = [x.draw_batch(views, 21, slice(1, None, 2)).pixels.cpu() for x in (resumed, resumed)]
+    assert torch.equal(pixels[0], batches[5].pixels.cpu()[1::2]) and torch.equal(*pixels)
+
+
 @pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])
 def test_picture_step_on_device_needs_no_wait(name: str, device: torch.device, tmp_path: Path):
     system, data = build_system_and_data(small_options(name), tmp_path)
