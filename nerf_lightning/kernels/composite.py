@@ -13,13 +13,10 @@ from nerf_lightning.kernels.segment_sums import exclusive_sum
 
 CompositedRays = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
 """Weighted sums of color, opacity and distance along each ray."""
-VisibleSamples = tuple[
-    Float[Tensor, "K"],
-    tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]],
-    Bool[Tensor, "R"] | None,
-]
-"""Optical depth of the K kept samples of N, their `Packed` intervals, and with a capacity, whether a ray has all its samples:
-both the given and the kept ones fitted."""
+PackedSelection = tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
+"""`Packed` intervals of K samples of N."""
+VisibleSamples = tuple[Float[Tensor, "K"], PackedSelection, Bool[Tensor, "R"] | None]
+"""Optical depth and intervals of the kept samples and, with a capacity, whether a ray has all: given and kept ones fitted."""
 
 
 def volume_weights(

@@ -6,10 +6,10 @@ from torch import Tensor
 
 from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.backend import has_fast_kernel
-from nerf_lightning.kernels.composite import volume_weights
+from nerf_lightning.kernels.composite import PackedSelection, volume_weights
 from nerf_lightning.kernels.march import Packed, offsets_from_counts
 
-MergedSamples = tuple[Float[Tensor, "K"], Packed]
+MergedSamples = tuple[Float[Tensor, "K"], PackedSelection]
 """Optical depth of the K remaining samples, and their intervals."""
 MAX_MIDPOINT_DISTANCE = 0.625
 """Maximum distance of adjacent midpoints relative to the sum of lengths: 0.5 if they touch, 0.75 or more with a gap."""

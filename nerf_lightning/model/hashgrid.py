@@ -162,6 +162,7 @@ class HashGridField(Field):
     def features(
         self, positions: Float[Tensor, "N 3"], unit_length: float = 1.0
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+        """See `Field.features`; the density is divided by `unit_length`."""
         encoded, layers = self.grid(self.bounds.to_unit(positions)), layer_parameters(self.density_net)
         density, geometry = mlp_heads(encoded, layers, 1, None, self.activation, unit_length)
         return density.squeeze(1), geometry

@@ -162,6 +162,7 @@ class TensoRFField(Field):
     def features(
         self, positions: Float[Tensor, "N 3"], unit_length: float = 1.0
     ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+        """See `Field.features`; the density is divided by `unit_length`."""
         density, color = self.density_volume, self.color_volume
         factors = (density.planes, density.lines), (color.planes, color.lines)
         return plane_line_sum_and_products(*factors, self.bounds.to_unit(positions), self.activation, unit_length)

@@ -170,15 +170,14 @@ class OccupancySampler(Sampler):
         self.capacity, self.min_depth = SampleCapacity(), None
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
-        origins = rays.origins
         if generator is None:
             samples, eps = self.eval_samples, max(self.early_stop_eps, INVISIBLE_DEPTH)
-            shift, cells = torch.zeros_like(origins[:, 0]), self.grid.occupied
+            shift, cells = torch.zeros_like(rays.origins[:, 0]), self.grid.occupied
             depths, packed = self._march(rays, density, shift, cells, samples, eps)
             # Evaluation must not depend on ray chunks: only training drops steps relative to the mean.
             depths, packed, _ = filter_visible(depths, packed, eps, INVISIBLE_DEPTH, max_dropped=INVISIBLE_DEPTH)
             return Samples(*packed, optical_depth=depths)
-        shift = torch.rand(len(rays), generator=generator, device=origins.device)
+        shift = torch.rand(len(rays), generator=generator, device=rays.origins.device)
         cells = self.grid.occupied if self.full_pass else self.grid.active
         (capacity, kept_capacity), eps = self.capacity.sizes(len(rays), self.full_pass), self.early_stop_eps
         depths, packed = self._march(rays, density, shift, cells, self.samples, eps, capacity)

@@ -35,8 +35,7 @@ def index_axis(position, axis, center, half_size, resolution):
     """Cells along an axis of a grid over the bounds."""
     half = tl.load(half_size + axis) + tl.zeros_like(position)
     unit = tl.div_rn(position - (tl.load(center + axis) - half), 2 * half)
-    scaled = tl.where(unit == unit, unit * resolution, 0.0)
-    return tl.minimum(tl.maximum(scaled.to(tl.int32), 0), resolution - 1)
+    return tl.minimum(tl.maximum(unit * resolution, 0.0), resolution - 1.0).to(tl.int32)  # NaN: 0
 
 
 @triton.jit

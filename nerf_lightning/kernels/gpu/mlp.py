@@ -118,27 +118,19 @@ def propagate(
 
 
 @triton.jit
-def add_gradients(
-    grad_weight, grad_bias, above, below, first, inputs, width, outputs, IN: tl.constexpr, OUT: tl.constexpr
-):
-    """Adds the gradients of a bias, and of columns first : first + inputs of a matrix [outputs, width]."""
-    i, o = tl.arange(0, IN)[None, :], tl.arange(0, OUT)
-    product = tl.dot(tl.trans(above), below, input_precision="tf32")
-    is_entry = (o < outputs)[:, None] & (i < inputs)
-    tl.atomic_add(grad_weight + o[:, None] * width + first + i, product, is_entry, sem="relaxed")
-    if grad_bias is not None:
-        tl.atomic_add(grad_bias + o, tl.sum(above, axis=0), o < outputs, sem="relaxed")
-    tl.debug_barrier()  # else the compiler loads what comes next too early, and spills registers
+def add_bias_gradient(grad_bias, grad, outputs, OUT: tl.constexpr):
+    o = tl.arange(0, OUT)
+    tl.atomic_add(grad_bias + o, tl.sum(grad, axis=0), o < outputs, sem="relaxed")
 
 
 @kernel(num_warps=8)
 def differentiate(
-    x, extra, w1, b1, w2, b2, w3, head, grad_head, grad_rest, grad_x, g_w1, g_b1, g_w2, g_b2, g_w3, g_b3,
+    x, extra, w1, b1, w2, b2, w3, head, grad_head, grad_rest, grad_x, h1, h2, g1, g2, g3, bias_gradients,
     count, inputs, extras, hidden, outputs, heads, scale,
     ACTIVATION: tl.constexpr, TWO: tl.constexpr, IN: tl.constexpr, EX: tl.constexpr, HID: tl.constexpr,
     OUT: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of inputs, and those of all parameters, added up."""
+    """Gradients of inputs and biases, and the factors of the matrices' gradients: inputs h and gradients g of layers."""
     i = tl.program_id(0) * B + tl.arange(0, B)
     is_input = i < count
     first, second = compute_hidden(x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID)
@@ -149,20 +141,21 @@ def differentiate(
         above *= value * (1 - value)
     pointers, is_rest = point_at_rest(grad_rest, i, is_input, heads, outputs, OUT)
     above += tl.load(pointers, is_rest, 0.0)
-    add_gradients(g_w3, g_b3, above, second, 0, hidden, hidden, outputs, HID, OUT)
+    add_bias_gradient(bias_gradients + 2 * hidden, above, outputs, OUT)
+    store_block(g3, above, i, is_input, outputs, OUT)
+    store_block(h2, second, i, is_input, hidden, HID)
     last = tl.trans(load_transposed(w3, 0, hidden, hidden, outputs, HID, OUT))
     above = tl.where(second <= 0, 0.0, tl.dot(above, last, input_precision="tf32"))
     if TWO:
         above = tl.where(is_input[:, None], above, 0.0)
-        add_gradients(g_w2, g_b2, above, first, 0, hidden, hidden, hidden, HID, HID)
+        add_bias_gradient(bias_gradients + hidden, above, hidden, HID)
+        store_block(g2, above, i, is_input, hidden, HID)
+        store_block(h1, first, i, is_input, hidden, HID)
         middle = tl.trans(load_transposed(w2, 0, hidden, hidden, hidden, HID, HID))
         above = tl.where(first <= 0, 0.0, tl.dot(above, middle, input_precision="tf32"))
     above = tl.where(is_input[:, None], above, 0.0)
-    block = load_block(x, i, is_input, inputs, IN)  # once more: it would occupy registers all along
-    add_gradients(g_w1, g_b1, above, block, 0, inputs, inputs + extras, hidden, IN, HID)
-    if EX > 0:
-        block = load_block(extra, i, is_input, extras, EX)
-        add_gradients(g_w1, None, above, block, inputs, extras, inputs + extras, hidden, EX, HID)
+    add_bias_gradient(bias_gradients, above, hidden, HID)
+    store_block(g1, above, i, is_input, hidden, HID)
     matrix = tl.trans(load_transposed(w1, 0, inputs, inputs + extras, hidden, IN, HID))
     store_block(grad_x, tl.dot(above, matrix, input_precision="tf32"), i, is_input, inputs, IN)
 
@@ -209,9 +202,15 @@ class MLP(torch.autograd.Function):
             grad.contiguous() if grad is not None else x.new_zeros(count, width) if width else x
             for grad, width in zip(grads, widths, strict=True)
         ]
-        grad_x, sizes = torch.empty_like(x), [p.numel() for p in layers]
-        gradients = [part.view_as(p) for part, p in zip(x.new_zeros(sum(sizes)).split(sizes), layers, strict=True)]
-        inputs = x, extra, *layers[:2], *layers[-4:-1], head, *above
-        outputs = grad_x, *gradients[:2], *gradients[-4:]
-        differentiate((triton.cdiv(count, BLOCK),), *inputs, *outputs, *ctx.shape, **ctx.constants)
+        _, inputs, extras, hidden, outputs, *_ = ctx.shape
+        grad_x, (h1, h2, g1, g2), g3 = torch.empty_like(x), x.new_empty(4, count, hidden), x.new_empty(count, outputs)
+        biases = x.new_zeros(2 * hidden + outputs)
+        given = x, extra, *layers[:2], *layers[-4:-1], head, *above, grad_x, h1, h2, g1, g2, g3, biases
+        differentiate((triton.cdiv(count, BLOCK),), *given, *ctx.shape, **ctx.constants)
+        first = x.new_empty(hidden, inputs + extras)
+        torch.mm(g1.T, x, out=first[:, :inputs])
+        if extras:
+            torch.mm(g1.T, extra, out=first[:, inputs:])
+        middle = [g2.T @ h1, biases[hidden : 2 * hidden]] if ctx.constants["TWO"] else []
+        gradients = first, biases[:hidden], *middle, g3.T @ h2, biases[2 * hidden :]
         return grad_x, None, None, None, None, *gradients
