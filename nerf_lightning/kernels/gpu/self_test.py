@@ -2,7 +2,7 @@
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -48,23 +48,24 @@ def find_obstacle(device: torch.device) -> str:
 
 def find_failure(device: torch.device) -> str:
     """Name of a kernel that fails or differs from the reference, and how; "" if there is none."""
-    choice = get_kernels()
-    try:
-        for name, (function, free) in make_checks(device).items():
-            set_kernels("reference")
-            expected = compute_with_gradients(function, free)
-            set_kernels("triton")
-            try:
-                actual = compute_with_gradients(function, free)
-            except Exception as error:
-                log.debug("self-test of %s", name, exc_info=True)
-                return f"{name}: {type(error).__name__}: {' '.join(str(error).split())}"
-            difference = max(map(relative_difference, actual, expected))
-            if not difference <= TOLERANCE:
-                return f"{name} differs from the reference by {difference:.1e}"
-        return ""
-    finally:
-        set_kernels(choice)
+    for name, difference in measure_differences(device):
+        if isinstance(difference, str):
+            return f"{name}: {difference}"
+        if not difference <= TOLERANCE:
+            return f"{name} differs from the reference by {difference:.1e}"
+    return ""
+
+
+def measure_differences(device: torch.device) -> Iterator[tuple[str, float | str]]:
+    """Yields each kernel's name and its largest difference from the reference, or its error."""
+    for name, (function, free) in make_checks(device).items():
+        try:
+            actual = compute_with_gradients("triton", function, free)
+        except Exception as error:
+            log.debug("self-test of %s", name, exc_info=True)
+            yield name, f"{type(error).__name__}: {' '.join(str(error).split())}"
+            continue
+        yield name, max(map(relative_difference, actual, compute_with_gradients("reference", function, free)))
 
 
 def make_checks(device: torch.device) -> dict[str, tuple[Callable[..., Any], list[Tensor]]]:
@@ -113,12 +114,16 @@ def mask_padding(packed: Packed) -> list[Tensor]:
     return [t * (dt > 0), dt, ray * (dt > 0), offsets]
 
 
-def compute_with_gradients(function: Callable[..., Any], inputs: list[Tensor]) -> list[Tensor]:
-    """Outputs of a function, and the gradients of the sum of the squares of those that have any."""
-    free = [x.detach().requires_grad_() for x in inputs]
-    outputs = list(function(*free))
-    loss = sum(x.square().sum() for x in outputs if x.requires_grad)
-    return [*(x.detach() for x in outputs), *(torch.autograd.grad(loss, free) if free else ())]
+def compute_with_gradients(choice: str, function: Callable[..., Any], inputs: list[Tensor]) -> list[Tensor]:
+    """Outputs of a function with a choice of `set_kernels`, and the gradients of the sum of the squares of those that have any."""
+    free, before = [x.detach().requires_grad_() for x in inputs], get_kernels()
+    set_kernels(choice)
+    try:
+        outputs = list(function(*free))
+        loss = sum(x.square().sum() for x in outputs if x.requires_grad)
+        return [*(x.detach() for x in outputs), *(torch.autograd.grad(loss, free) if free else ())]
+    finally:
+        set_kernels(before)
 
 
 def relative_difference(actual: Tensor, expected: Tensor) -> float:
