@@ -115,7 +115,7 @@ def mask_padding(packed: Packed) -> list[Tensor]:
 
 
 def compute_with_gradients(choice: str, function: Callable[..., Any], inputs: list[Tensor]) -> list[Tensor]:
-    """Outputs of a function with a choice of `set_kernels`, and the gradients of the sum of the squares of those that have any."""
+    """Outputs of a function with these kernels, and the gradients of the sum of the squares of those that have any."""
     free, before = [x.detach().requires_grad_() for x in inputs], get_kernels()
     set_kernels(choice)
     try:
