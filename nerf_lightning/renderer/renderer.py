@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
@@ -26,16 +26,25 @@ FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], FieldOutput | t
 class RenderOutput:
     """Rendered rays."""
 
-    rgb: Float[Tensor, "R 3"]
-    """Color composited onto the background."""
+    foreground: Float[Tensor, "R 3"]
+    """Color without background."""
     opacity: Float[Tensor, "R"]
     """Accumulated opacity in [0, 1]."""
     distance: Float[Tensor, "R"]
     """Depth times opacity, world units."""
+    backgrounds: Float[Tensor, "R 3"] | None = None
+    """Color behind each ray; None: black."""
     weights: Float[Tensor, "N"] | None = None
     """Rendering weights with gradient; None if no loss needs them."""
     view_residual: Float[Tensor, "N 3"] | None = None
     """See `FieldOutput`."""
+
+    @property
+    def rgb(self) -> Float[Tensor, "R 3"]:
+        """Color composited onto the background."""
+        if self.backgrounds is None:
+            return self.foreground
+        return torch.addcmul(self.foreground, (1 - self.opacity)[:, None], self.backgrounds)
 
     @property
     def depth(self) -> Float[Tensor, "R"]:
@@ -43,18 +52,9 @@ class RenderOutput:
         return self.distance / self.opacity.clamp_min(1e-6)
 
 
-def composite_over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-    """Composites photo pixels with straight alpha (C = 4) onto backgrounds; returns RGB in [0, 1]."""
-    colors = (pixels / 255).to(backgrounds.dtype)
-    if colors.shape[1] == 3:
-        return colors
-    return torch.lerp(backgrounds, colors[:, :3], colors[:, 3:])
-
-
 def shade_groups(field: HashGridField, rays: Rays, samples: Samples) -> FieldOutput:
     """Field at samples, with one view-dependent residual for every `SHADING_GROUP` neighbors, of their mean features."""
-    density, features = field.features(samples.positions(rays))
-    density = density / field.unit_length
+    density, features = field.features(samples.positions(rays), field.unit_length)
     means, index, ray = average_neighbors(density * samples.dt, features, samples.ray, samples.offsets, SHADING_GROUP)
     residual = field.view_logits(means, rays.directions.index_select(0, ray))
     return FieldOutput(density, field.shade(features, residual.T.index_select(1, index).T))
@@ -118,12 +118,11 @@ class VolumeRenderer(torch.nn.Module):
         if self.unbounded and not has_gradient:
             # Median for unbounded scenes: 1 % of stray weight at the far plane would dominate the mean.
             distance = opacity * median_depth(density, opacity, packed)
-        color = torch.addcmul(foreground, (1 - opacity)[:, None], backgrounds)
         has_losses = self.distortion_loss_weight or self.near_loss_weight or self.view_loss_weight
         if not (self.training and has_gradient and (has_losses or samples.proposals is not None)):
-            return RenderOutput(color, opacity, distance)  # a full view has too many samples to keep
+            return RenderOutput(foreground, opacity, distance, backgrounds)  # a full view has too many samples to keep
         weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-        return RenderOutput(color, opacity, distance, weights, view_residual)
+        return RenderOutput(foreground, opacity, distance, backgrounds, weights, view_residual)
 
     def losses(
         self, output: RenderOutput, samples: Samples, progress: float, texturelessness: Float[Tensor, "R"] | None = None

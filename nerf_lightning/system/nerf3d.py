@@ -12,6 +12,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.dataset.ray_datamodule import STEPS_PER_DRAW
+from nerf_lightning.kernels import mean_squared_error, photometric_loss
 from nerf_lightning.kernels.backend import get_kernels
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
@@ -154,17 +155,16 @@ class NeRF3D(System):
             samples = self.sampler(rays.detach(), self.field.density, generator)
         backgrounds = self.renderer.background.sample(len(rays), generator)
         output = self.renderer(rays, samples, self.field, backgrounds)
-        truth, rgb = composite_over(batch.pixels, backgrounds), output.rgb
-        if self.corrections is not None:
+        weights = batch.weights, samples.complete
+        if self.corrections is None:
+            pixels = backgrounds, batch.pixels
+            loss, squared_errors = photometric_loss(output.foreground, output.opacity, *pixels, *weights)
+        else:
             assert batch.views is not None
-            rgb = self.corrections.color(rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
-        if samples.complete is not None:  # truncated rays must not contribute
-            rgb = torch.where(samples.complete[:, None], rgb, truth)
-        squared_errors = (rgb - truth).square().mean(1)
-        losses = {
-            "photometric": (squared_errors if batch.weights is None else squared_errors * batch.weights).mean(),
-            **self.regularize(output, samples, batch),
-        }
+            truth = composite_over(batch.pixels, backgrounds)
+            rgb = self.corrections.color(output.rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
+            loss, squared_errors = mean_squared_error(rgb, truth, *weights)
+        losses = {"photometric": loss, **self.regularize(output, samples, batch)}
         per_ray = self.sampler.samples_per_ray
         stats = StepStats(
             losses["photometric"].detach(),
@@ -246,8 +246,9 @@ class NeRF3D(System):
                 samples = samples.clip(near, far)
             for span, part in split_by_rays(samples.merge_low_weight_samples(), chunk_samples):
                 outputs.append(self.renderer(chunk[span], part, self.field, color.expand(len(chunk[span]), 3)))
-        names = ("rgb", "opacity", "distance")
-        return RenderOutput(*(torch.cat([getattr(output, name) for output in outputs]) for name in names))
+        names = ("foreground", "opacity", "distance")
+        rendered = (torch.cat([getattr(output, name) for output in outputs]) for name in names)
+        return RenderOutput(*rendered, color.expand(len(rays), 3))
 
     @property
     def background(self) -> list[float]:
