@@ -8,6 +8,7 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels import interval_midpoints, resample
+from nerf_lightning.kernels.cached_constants import cache_constants
 from nerf_lightning.model.hashgrid import HashGrid, cubic_cells
 from nerf_lightning.sampler.occupancy import OccupancySampler
 from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
@@ -17,6 +18,16 @@ INIT_LOG_DENSITY = -1.0
 """Initial log-density of the proposal field, 1 / half-size: thin fog."""
 ANNEAL_SLOPE = 10.0
 """Slope of the annealing bias curve (mip-NeRF 360, section 3.2)."""
+
+
+@cache_constants
+def _make_even_edges(
+    intervals: int, device: torch.device
+) -> tuple[Float[Tensor, "S_plus_1"], Float[Tensor, "S_plus_1"]]:
+    """Even edges in [0, 1], and the divisors of a shift in intervals, infinite at both ends."""
+    divisors = torch.full((intervals + 1,), float(intervals))
+    divisors[0] = divisors[-1] = torch.inf
+    return torch.linspace(0, 1, intervals + 1, device=device), divisors.to(device)
 
 
 class ProposalSampler(Sampler):
@@ -76,29 +87,26 @@ class ProposalSampler(Sampler):
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
         count, device = len(rays), near.device
-        s = torch.linspace(0, 1, self.coarse_samples + 1, device=device).expand(count, -1)
-        if generator is not None:
-            jitter = self._jitter(rays, generator) / self.coarse_samples
-            s = torch.cat([s[:, :1], s[:, 1:-1] + jitter, s[:, -1:]], dim=1)
+        if generator is None:
+            shifts = torch.zeros(3, count, device=device).unbind()
+        else:  # in intervals, uniform in [-1/2, 1/2); new tensors, as kernels are compiled for their alignment
+            uniform = torch.rand(3, count, generator=generator, device=device)
+            shifts = torch._foreach_sub(uniform.unbind(), 0.5)
+        even, divisors = _make_even_edges(self.coarse_samples, device)
+        s = torch.addcdiv(even, shifts[0][:, None], divisors)
         histograms: list[Histogram] = []
-        for num_samples in (self.fine_samples, self.samples):
+        for num_samples, shift in ((self.fine_samples, shifts[1]), (self.samples, shifts[2])):
             with torch.set_grad_enabled(generator is not None):
                 histograms.append(Histogram(s, self.weights(rays, near, far, s)))
             pdf = histograms[-1].weights.detach() + self.histogram_padding / s.shape[1]
             if generator is not None:
                 pdf = pdf**self.anneal_exponent
-            s = resample(s, pdf, self._jitter(rays, generator)[:, 0], num_samples)
+            s = resample(s, pdf, shift, num_samples)
         _, t, dt = interval_midpoints(rays, self.bounds, near, far, s)
         ray = torch.arange(count, device=device).repeat_interleave(self.samples)
         offsets = torch.arange(count + 1, device=device) * self.samples
         proposals = None if generator is None else Proposals(tuple(histograms), s)
         return Samples(t.flatten(), dt.flatten(), ray, offsets, proposals=proposals)
-
-    def _jitter(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "R 1"]:
-        """Shift of the edges in intervals, uniform in [-1/2, 1/2); zero without a generator."""
-        if generator is None:
-            return torch.zeros(len(rays), 1, device=rays.origins.device)
-        return torch.rand(len(rays), 1, generator=generator, device=rays.origins.device) - 0.5
 
     @property
     def anneal_exponent(self) -> float:

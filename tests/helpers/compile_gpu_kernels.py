@@ -27,6 +27,9 @@ CALLS = (
     "hash_interpolate",
     "plane_line_products",
     "plane_line_sum",
+    "interval_midpoints",
+    "resample, as many as fit",
+    "volume_weights",
     "mlp, one hidden layer",
     "mlp, two hidden layers",
 )

@@ -91,6 +91,33 @@ def run_network(widths: list[int], num_extra: int, num_head: int, count: int) ->
     return call, [x, torch.randn(count, num_extra), *parameters], (1,)
 
 
+def locate_midpoints(num_rays: int, steps: int) -> Call:
+    bounds = Bounds(torch.tensor([[-1.0, -1.1, -0.9], [1, 1.05, 1]]), unbounded=True)
+    origins, directions = 2 * torch.randn(num_rays, 3), normalize(torch.randn(num_rays, 3), dim=1)  # some miss the box
+    directions[1] = torch.tensor([0.0, 0, 1])
+    origins[2, 0] = math.nan
+
+    def call(origins: Any, directions: Any, s: Any) -> Any:
+        rays = Rays(origins, directions)
+        return kernels.interval_midpoints(rays, bounds, *bounds.near_far(rays), s)
+
+    return call, [origins, directions, make_edges(num_rays, steps)], (0, 1, 2)
+
+
+def make_edges(num_rays: int, intervals: int) -> torch.Tensor:
+    """Ascending edges in [0, 1], some equal."""
+    edges = torch.rand(num_rays, intervals + 1).sort(1).values
+    edges[:, 3] = edges[:, 2]
+    return edges
+
+
+def resample_rays(num_rays: int, steps: int, count: int) -> Call:
+    pdf = torch.rand(num_rays, steps) + 0.2
+    pdf[1], pdf[2, 4] = 0, math.nan
+    inputs = [make_edges(num_rays, steps), pdf, torch.rand(num_rays) - 0.5]
+    return lambda *inputs: kernels.resample(*inputs, count), inputs, (0, 1, 2)
+
+
 def list_calls() -> dict[str, Call]:
     """All calls by name."""
     torch.manual_seed(3)
@@ -111,6 +138,9 @@ def list_calls() -> dict[str, Call]:
         "plane_line_products": multiply_planes(kernels.plane_line_products, 12, 16, 40),
         "plane_line_products, odd channels": multiply_planes(kernels.plane_line_products, 5, 3, 33),
         "plane_line_sum": multiply_planes(kernels.plane_line_sum, 20, 8, 64),
+        "interval_midpoints": locate_midpoints(20, 9),
+        "resample": resample_rays(5, 24, 16),
+        "resample, as many as fit": resample_rays(4, 64, 40),
         "mlp, one hidden layer": run_network([16, 64, 16], 0, 1, 70),
         "mlp, two hidden layers": run_network([31, 64, 64, 3], 16, 0, 100),
         "mlp, odd widths": run_network([60, 24, 3], 12, 2, 5),

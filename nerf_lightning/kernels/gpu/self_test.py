@@ -3,6 +3,7 @@
 import functools
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,6 +14,7 @@ from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels.composite import composite_reference, filter_visible_reference
 from nerf_lightning.kernels.hashgrid import hash_interpolate_reference
 from nerf_lightning.kernels.march import Packed, march_reference
+from nerf_lightning.kernels.resampling import interval_midpoints_reference, resample_reference
 from nerf_lightning.kernels.vector_matrix import products_reference
 
 log = logging.getLogger(__name__)
@@ -62,13 +64,13 @@ def find_failure(device: torch.device) -> str:
     return ""
 
 
-Check = tuple[Callable[..., Any], Callable[..., Any], list[Tensor], int]
+Check = tuple[Callable[..., Any], Callable[..., Any], list[Any], int]
 """Fast version, reference, their inputs, and how many of the first inputs get gradients."""
 
 
 def make_checks(device: torch.device) -> dict[str, Check]:
     """Makes a check of each kernel, by name."""
-    from nerf_lightning.kernels.gpu import composite, hashgrid, march, vector_matrix
+    from nerf_lightning.kernels.gpu import composite, hashgrid, march, resampling, vector_matrix
 
     generator = torch.Generator().manual_seed(0)
 
@@ -87,6 +89,8 @@ def make_checks(device: torch.device) -> dict[str, Check]:
     filter_limits = 1e-2, 0.02, CAPACITY, float("inf")
     cells, sizes = [(4, 4, 4), (40, 40, 40)], [125, 1024]
     unit = rand(NUM_POSITIONS, 3)
+    edges, shares = rand(NUM_RAYS, 25).sort(1).values, rand(NUM_RAYS, 24) + 0.1
+    room = replace(bounds, unbounded=True)
     return {
         "march": (
             lambda *limits: mask_padding(march.march(rays, bounds, *limits, *steps)),  # type: ignore[call-arg]
@@ -118,6 +122,13 @@ def make_checks(device: torch.device) -> dict[str, Check]:
             [rand(3, 20, 20, 16), rand(3, 20, 16)],
             2,
         ),
+        "interval_midpoints": (
+            lambda edges: resampling.interval_midpoints(rays, room, *room.near_far(rays), edges),
+            lambda edges: interval_midpoints_reference(rays, room, *room.near_far(rays), edges),
+            [edges],
+            0,
+        ),
+        "resample": (resampling.resample, resample_reference, [edges, shares, limits[2] - 0.5, 16], 0),
     }
 
 
@@ -127,10 +138,11 @@ def mask_padding(packed: Packed) -> list[Tensor]:
     return [t * (dt > 0), dt, ray * (dt > 0), offsets]
 
 
-def compute_with_gradients(function: Callable[..., Any], inputs: list[Tensor], num_free: int) -> list[Tensor]:
+def compute_with_gradients(function: Callable[..., Any], inputs: list[Any], num_free: int) -> list[Tensor]:
     """Outputs of a function, and the gradients of their sum of squares with respect to its first inputs."""
     free = [x.detach().requires_grad_() for x in inputs[:num_free]]
-    outputs = list(function(*free, *inputs[num_free:]))
+    outputs = function(*free, *inputs[num_free:])
+    outputs = [outputs] if isinstance(outputs, Tensor) else list(outputs)
     gradients = torch.autograd.grad(sum(x.square().sum() for x in outputs), free) if free else ()
     return [*(x.detach() for x in outputs), *gradients]
 
