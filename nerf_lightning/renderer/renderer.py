@@ -126,7 +126,8 @@ class VolumeRenderer(torch.nn.Module):
         has_losses = self.distortion_loss_weight or self.near_loss_weight or self.view_loss_weight
         if not (self.training and has_gradient and (has_losses or samples.proposals is not None)):
             return RenderOutput(color, opacity, distance)  # a full view has too many samples to keep
-        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
+        per_ray = None if samples.proposals is None else samples.proposals.edges.shape[1] - 1
+        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets, per_ray)
         return RenderOutput(color, opacity, distance, weights, view_residual)
 
     def losses(

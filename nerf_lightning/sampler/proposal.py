@@ -1,5 +1,6 @@
 """Proposal network sampling (mip-NeRF 360): a small density field predicts where to sample the main field."""
 
+import functools
 from typing import Annotated, Any
 
 import torch
@@ -7,11 +8,11 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import interval_midpoints, resample
+from nerf_lightning.kernels import interlevel_loss, interval_midpoints, proposal_weights, resample
 from nerf_lightning.kernels.cached_constants import cache_constants
 from nerf_lightning.model.hashgrid import HashGrid, cubic_cells
 from nerf_lightning.sampler.occupancy import OccupancySampler
-from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
+from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposals, Sampler, Samples
 from nerf_lightning.utils.option_checks import Count, GridSize, Gt, Layers, Le, Log2Size, Lt
 
 INIT_LOG_DENSITY = -1.0
@@ -118,17 +119,16 @@ class ProposalSampler(Sampler):
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]
     ) -> Float[Tensor, "R S"]:
         """Rendering weights of the proposal field, see `volume_weights`."""
-        unit, t, dt = interval_midpoints(rays, self.bounds, near, far, s)
-        density = torch.exp(self.grid(unit).sum(1) + INIT_LOG_DENSITY)
-        return interval_weights(density.view(t.shape) * (dt / self.unit_length))
+        unit, _, dt = interval_midpoints(rays, self.bounds, near, far, s)
+        return proposal_weights(self.grid(unit), dt, INIT_LOG_DENSITY, self.unit_length)
 
     def losses(self, samples: Samples, weights: Float[Tensor, "N"] | None) -> dict[str, Float[Tensor, ""]]:
         if samples.proposals is None or weights is None:
             return {}
         histograms, edges = samples.proposals
         main_weights = weights.detach().view(len(edges), -1)
-        terms = [interlevel_loss(edges, main_weights, histogram) for histogram in histograms]
-        return {"interlevel": torch.stack(terms).sum()}
+        terms = [interlevel_loss(found.weights, found.edges, edges, main_weights) for found in histograms]
+        return {"interlevel": functools.reduce(torch.add, terms)}
 
     @torch.no_grad()
     def restart(self, step: int) -> None:
@@ -137,24 +137,6 @@ class ProposalSampler(Sampler):
 
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         self.step = step
-
-
-def interlevel_loss(
-    edges: Float[Tensor, "R K_plus_1"], weights: Float[Tensor, "R K"], proposed: Histogram
-) -> Float[Tensor, ""]:
-    """Interlevel loss, mip-NeRF 360 eq. 12 and 13, mean over rays: penalizes weight above the proposal histogram's bound.
-
-    Args:
-        edges, weights: intervals of the main field.
-        proposed: histogram of the proposal field, with gradient.
-    """
-    last = proposed.weights.shape[1]
-    sums = torch.nn.functional.pad(proposed.weights.cumsum(1), (1, 0))
-    proposed_edges = proposed.edges.contiguous()
-    low = (torch.searchsorted(proposed_edges, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, last)
-    high = torch.searchsorted(proposed_edges, edges[:, 1:].contiguous()).clamp(0, last)
-    bound = sums.gather(1, high) - sums.gather(1, low)
-    return ((weights - bound).clamp_min(0) ** 2 / (weights + 1e-5)).sum(1).mean()
 
 
 def choose_sampler(bounds: Bounds, chunk: int = CHUNK) -> Sampler:

@@ -96,11 +96,6 @@ class Samples:
         return Samples(*packed, optical_depth=optical_depth)
 
 
-def interval_weights(optical_depth: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
-    """Rendering weights from optical depths (density times length), see `volume_weights`."""
-    return torch.exp(optical_depth - optical_depth.cumsum(1)) * -torch.expm1(-optical_depth)
-
-
 def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Samples:
     """Packs the kept intervals between consecutive edges of each ray."""
     return Samples(*pack_intervals(edges, keep))

@@ -30,6 +30,8 @@ CALLS = (
     "interval_midpoints",
     "resample, as many as fit",
     "volume_weights",
+    "proposal_weights",
+    "interlevel_loss",
     "mlp, one hidden layer",
     "mlp, two hidden layers",
 )

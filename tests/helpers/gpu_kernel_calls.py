@@ -118,6 +118,26 @@ def resample_rays(num_rays: int, steps: int, count: int) -> Call:
     return lambda *inputs: kernels.resample(*inputs, count), inputs, (0, 1, 2)
 
 
+def weigh_proposals(num_rays: int, steps: int, levels: int) -> Call:
+    features = 2 * torch.randn(num_rays * steps, levels)
+    features[:steps], features[-3] = -100, math.nan
+    inputs = [features, torch.rand(num_rays, steps) * (torch.rand(num_rays, steps) < 0.8)]
+    return lambda *inputs: kernels.proposal_weights(*inputs, -1.0, 0.7), inputs, (1,)
+
+
+def weigh_samples(num_rays: int, per_ray: int) -> Call:
+    ray = torch.arange(num_rays).repeat_interleave(per_ray)
+    density, dt, offsets = 9 * torch.rand(len(ray)) ** 3, torch.rand(len(ray)), torch.arange(num_rays + 1) * per_ray
+    return lambda *inputs: kernels.volume_weights(*inputs, per_ray), [density, dt, ray, offsets], (1,)
+
+
+def bound_weights(num_rays: int, count: int, steps: int) -> Call:
+    weights, proposed = torch.rand(num_rays, count) / count, torch.rand(num_rays, steps) / steps
+    weights[1], weights[2, 1], proposed[3] = 0, math.nan, 0
+    edges = torch.cat([make_edges(num_rays - 2, count), torch.linspace(0, 1, count + 1).expand(2, -1)])
+    return kernels.interlevel_loss, [proposed, make_edges(num_rays, steps), edges, weights], (1, 2, 3)
+
+
 def list_calls() -> dict[str, Call]:
     """All calls by name."""
     torch.manual_seed(3)
@@ -141,6 +161,10 @@ def list_calls() -> dict[str, Call]:
         "interval_midpoints": locate_midpoints(20, 9),
         "resample": resample_rays(5, 24, 16),
         "resample, as many as fit": resample_rays(4, 64, 40),
+        "proposal_weights": weigh_proposals(6, 24, 2),
+        "proposal_weights, one level": weigh_proposals(3, 64, 1),
+        "volume_weights": weigh_samples(5, 16),
+        "interlevel_loss": bound_weights(7, 16, 48),
         "mlp, one hidden layer": run_network([16, 64, 16], 0, 1, 70),
         "mlp, two hidden layers": run_network([31, 64, 64, 3], 16, 0, 100),
         "mlp, odd widths": run_network([60, 24, 3], 12, 2, 5),

@@ -1,11 +1,13 @@
-"""Resampling of intervals in unbounded scenes."""
+"""Proposal resampling in unbounded scenes: midpoints of intervals, weights, new intervals, and the interlevel loss."""
 
+import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels.gpu.launch import kernel
+from nerf_lightning.kernels.proposals import WEIGHT_EPS
 from nerf_lightning.kernels.resampling import PDF_EPS, IntervalMidpoints
 
 BLOCK = 128
@@ -101,3 +103,89 @@ def resample(s: Tensor, pdf: Tensor, shift: Tensor, count: int) -> Tensor:
     blocks = {"S": triton.next_power_of_2(pdf.shape[1]), "K": EDGES_PER_BLOCK}
     invert_cdf((len(s),), *inputs, out, pdf.shape[1], count, PDF_EPS, **blocks)
     return out
+
+
+@kernel(num_warps=1)
+def weigh_intervals(
+    features, dt, grad, out, steps, bias, length, HAS_GRAD: tl.constexpr, L: tl.constexpr, S: tl.constexpr
+):
+    """Weights of a ray's intervals or, with HAS_GRAD, the gradient of `features`: L parts of the log-density, or density."""
+    k = tl.arange(0, S)
+    i, is_interval, log_density = tl.program_id(0) * steps + k, k < steps, tl.zeros([S], tl.float32) + bias
+    for level in tl.static_range(L):
+        log_density += tl.load(features + i * L + level, is_interval, 0.0)
+    density = tl.exp(log_density) if L else tl.load(features + i, is_interval, 0.0)
+    scaled = tl.load(dt + i, is_interval, 0.0) / length
+    depth = density * scaled
+    transmittance, transparency = tl.exp(depth - tl.cumsum(depth, 0)), tl.exp(-depth)
+    weight = transmittance * (1 - transparency)
+    if HAS_GRAD:
+        above = tl.load(grad + i, is_interval, 0.0)
+        behind = tl.sum(weight * above) - tl.cumsum(weight * above, 0)
+        slope = transmittance * transparency * above - behind
+        for level in tl.static_range(L):
+            tl.store(out + i * L + level, depth * slope, is_interval)
+        if L == 0:
+            tl.store(out + i, scaled * slope, is_interval)
+    else:
+        tl.store(out + i, weight, is_interval)
+
+
+class IntervalWeights(torch.autograd.Function):
+    """`kernels.proposal_weights` or, of a density [N], `kernels.volume_weights`, for at most `MAX_INTERVALS` intervals."""
+
+    @staticmethod
+    def forward(ctx, features: Tensor, dt: Tensor, bias: float, length: float):
+        features, dt, out = features.contiguous(), dt.contiguous(), torch.empty_like(dt)
+        ctx.numbers = dt.shape[1], bias, length
+        ctx.constants = {"L": features.shape[1] if features.dim() > 1 else 0, "S": triton.next_power_of_2(dt.shape[1])}
+        weigh_intervals((len(dt),), features, dt, dt, out, *ctx.numbers, HAS_GRAD=False, **ctx.constants)
+        ctx.save_for_backward(features, dt)
+        return out
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):
+        features, dt = ctx.saved_tensors
+        out = torch.empty_like(features)
+        inputs = features, dt, grad.contiguous(), out
+        weigh_intervals((len(dt),), *inputs, *ctx.numbers, HAS_GRAD=True, **ctx.constants)
+        return out, None, None, None
+
+
+@kernel()
+def bound_weights(
+    proposed_weights, proposed_edges, edges, weights, loss, grad, rays, count, steps, eps,
+    K: tl.constexpr, S: tl.constexpr,
+):  # fmt: skip
+    """Interlevel loss of a ray and the gradient of the proposed weights; a bound adds those of all overlapping intervals."""
+    ray, k, j = tl.program_id(0), tl.arange(0, K)[:, None], tl.arange(0, S)[None, :]
+    main, proposed = edges + ray * (count + 1) + k, proposed_edges + ray * (steps + 1) + j
+    weight = tl.load(weights + ray * count + k, k < count, 0.0)
+    share = tl.load(proposed_weights + ray * steps + j, j < steps, 0.0)
+    overlaps = (tl.load(proposed + 1, j < steps, 0.0) > tl.load(main, k < count, 0.0)) & (k < count)
+    overlaps &= (tl.load(proposed, j < steps, 0.0) < tl.load(main + 1, k < count, 0.0)) & (j < steps)
+    bound = tl.sum(tl.where(overlaps, share, 0.0), 1)[:, None]
+    excess = tl.maximum(weight - bound, 0.0, tl.PropagateNan.ALL)
+    relative = excess / (weight + eps)
+    tl.store(loss + ray, tl.sum(excess * relative))
+    slope = -2 * tl.sum(tl.where(overlaps & (excess > 0), relative, 0.0), 0)[None, :] / rays
+    tl.store(grad + ray * steps + j, slope, j < steps)
+
+
+class InterlevelLoss(torch.autograd.Function):
+    """`kernels.interlevel_loss` of at most `MAX_INTERVALS` intervals."""
+
+    @staticmethod
+    def forward(ctx, *inputs: Tensor):
+        inputs = tuple(x.contiguous() for x in inputs)
+        proposed, _, _, weights = inputs
+        loss, grad = weights.new_empty(len(weights)), torch.empty_like(proposed)
+        sizes = len(weights), weights.shape[1], proposed.shape[1]
+        K, S = (triton.next_power_of_2(size) for size in sizes[1:])
+        bound_weights((len(weights),), *inputs, loss, grad, *sizes, WEIGHT_EPS, K=K, S=S)
+        ctx.save_for_backward(grad)
+        return loss.mean()
+
+    @staticmethod
+    def backward(ctx, above: Tensor):
+        return ctx.saved_tensors[0] * above, None, None, None

@@ -14,6 +14,7 @@ from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels.composite import composite_reference, filter_visible_reference
 from nerf_lightning.kernels.hashgrid import hash_interpolate_reference
 from nerf_lightning.kernels.march import Packed, march_reference
+from nerf_lightning.kernels.proposals import interlevel_loss_reference, proposal_weights_reference
 from nerf_lightning.kernels.resampling import interval_midpoints_reference, resample_reference
 from nerf_lightning.kernels.vector_matrix import products_reference
 
@@ -89,8 +90,9 @@ def make_checks(device: torch.device) -> dict[str, Check]:
     filter_limits = 1e-2, 0.02, CAPACITY, float("inf")
     cells, sizes = [(4, 4, 4), (40, 40, 40)], [125, 1024]
     unit = rand(NUM_POSITIONS, 3)
-    edges, shares = rand(NUM_RAYS, 25).sort(1).values, rand(NUM_RAYS, 24) + 0.1
+    edges, shares, main = rand(NUM_RAYS, 25).sort(1).values, rand(NUM_RAYS, 24) + 0.1, rand(NUM_RAYS, 16) / 16
     room = replace(bounds, unbounded=True)
+    interlevel = shares / 40, edges, edges[:, :17], main
     return {
         "march": (
             lambda *limits: mask_padding(march.march(rays, bounds, *limits, *steps)),  # type: ignore[call-arg]
@@ -129,6 +131,13 @@ def make_checks(device: torch.device) -> dict[str, Check]:
             0,
         ),
         "resample": (resampling.resample, resample_reference, [edges, shares, limits[2] - 0.5, 16], 0),
+        "proposal_weights": (
+            resampling.IntervalWeights.apply,
+            proposal_weights_reference,
+            [rand(24 * NUM_RAYS, 2), shares, -1.0, 0.5],
+            1,
+        ),
+        "interlevel_loss": (resampling.InterlevelLoss.apply, interlevel_loss_reference, [*interlevel], 1),
     }
 
 
