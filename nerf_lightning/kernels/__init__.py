@@ -22,6 +22,7 @@ from nerf_lightning.kernels.voxels import (
     mark_rows,
     total_variation,
 )
+from nerf_lightning.kernels.weight_losses import weight_losses
 
 __all__ = [
     "interlevel_loss",
@@ -54,5 +55,6 @@ __all__ = [
     "spherical_harmonics",
     "set_kernels",
     "volume_weights",
+    "weight_losses",
     "interpolate_scalar",
 ]

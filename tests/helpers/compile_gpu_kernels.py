@@ -32,6 +32,7 @@ CALLS = (
     "volume_weights",
     "proposal_weights",
     "interlevel_loss",
+    "weight_losses",
     "mlp, one hidden layer",
     "mlp, two hidden layers",
 )

@@ -138,6 +138,20 @@ def bound_weights(num_rays: int, count: int, steps: int) -> Call:
     return kernels.interlevel_loss, [proposed, make_edges(num_rays, steps), edges, weights], (1, 2, 3)
 
 
+def penalize_weights(has_nan: bool) -> Call:
+    samples = make_ragged_samples(RAY_COUNTS)
+    weights, residual = torch.rand(len(samples)) / 5, torch.randn(len(samples), 3)
+    residual[0] = 0
+    if has_nan:
+        weights[-10] = math.nan
+
+    def call(weights: Any, residual: Any, texturelessness: Any) -> Any:
+        factors = 0.5, 2.0, 1.5
+        return list(kernels.weight_losses(weights, residual, samples.packed, 0.7, factors, texturelessness).values())
+
+    return call, [weights, residual, torch.rand(len(RAY_COUNTS))], (0, 1, 2) if has_nan else (2,)
+
+
 def list_calls() -> dict[str, Call]:
     """All calls by name."""
     torch.manual_seed(3)
@@ -165,6 +179,8 @@ def list_calls() -> dict[str, Call]:
         "proposal_weights, one level": weigh_proposals(3, 64, 1),
         "volume_weights": weigh_samples(5, 16),
         "interlevel_loss": bound_weights(7, 16, 48),
+        "weight_losses": penalize_weights(False),
+        "weight_losses, NaN": penalize_weights(True),
         "mlp, one hidden layer": run_network([16, 64, 16], 0, 1, 70),
         "mlp, two hidden layers": run_network([31, 64, 64, 3], 16, 0, 100),
         "mlp, odd widths": run_network([60, 24, 3], 12, 2, 5),

@@ -17,6 +17,7 @@ from nerf_lightning.kernels.march import Packed, march_reference
 from nerf_lightning.kernels.proposals import interlevel_loss_reference, proposal_weights_reference
 from nerf_lightning.kernels.resampling import interval_midpoints_reference, resample_reference
 from nerf_lightning.kernels.vector_matrix import products_reference
+from nerf_lightning.kernels.weight_losses import weight_losses_reference
 
 log = logging.getLogger(__name__)
 
@@ -71,7 +72,7 @@ Check = tuple[Callable[..., Any], Callable[..., Any], list[Any], int]
 
 def make_checks(device: torch.device) -> dict[str, Check]:
     """Makes a check of each kernel, by name."""
-    from nerf_lightning.kernels.gpu import composite, hashgrid, march, resampling, vector_matrix
+    from nerf_lightning.kernels.gpu import composite, hashgrid, march, resampling, vector_matrix, weight_losses
 
     generator = torch.Generator().manual_seed(0)
 
@@ -93,6 +94,8 @@ def make_checks(device: torch.device) -> dict[str, Check]:
     edges, shares, main = rand(NUM_RAYS, 25).sort(1).values, rand(NUM_RAYS, 24) + 0.1, rand(NUM_RAYS, 16) / 16
     room = replace(bounds, unbounded=True)
     interlevel = shares / 40, edges, edges[:, :17], main
+    exact = march_reference(rays, bounds, *limits, *steps[:2], None)
+    penalized = rand(len(exact[0])), rand(len(exact[0]), 3), exact, 0.5, (1.0, 1.0, 1.0), rand(NUM_RAYS)
     return {
         "march": (
             lambda *limits: mask_padding(march.march(rays, bounds, *limits, *steps)),  # type: ignore[call-arg]
@@ -138,6 +141,7 @@ def make_checks(device: torch.device) -> dict[str, Check]:
             1,
         ),
         "interlevel_loss": (resampling.InterlevelLoss.apply, interlevel_loss_reference, [*interlevel], 1),
+        "weight_losses": (weight_losses.WeightLosses.apply, weight_losses_reference, [*penalized], 2),
     }
 
 
