@@ -131,7 +131,7 @@ def export_html(
 ) -> Path:
     """Write a self-contained interactive HTML viewer that works offline in any browser.
 
-    TensoRF and voxel fields are rendered directly; others are baked into voxels, which takes minutes.
+    TensoRF, hash-grid and voxel fields are drawn directly; others are baked into voxels.
 
     Args:
         all: Write a page for each run in a folder, and gallery.html with all of them side by side.

@@ -11,7 +11,7 @@ import nerf_lightning
 from nerf_lightning.drawing.panels import to_uint8
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.bake import bake_system, is_web_renderable
-from nerf_lightning.export.compress import compress_system, get_occupied_cells, measure_held_out_psnr, subsample_cameras
+from nerf_lightning.export.compress import MAX_BAKED_PIXELS, compress_system, measure_held_out_psnr
 from nerf_lightning.export.web_page import render_field_page, render_gallery_page, render_image_page
 from nerf_lightning.runs.compact import strip_local_paths
 from nerf_lightning.runs.folder import LoadedRun, config_to_dict
@@ -43,10 +43,11 @@ def build_page(
         quality = f"PSNR {measure_held_out_psnr(system, data):.2f} dB"
         facts = describe_run(source, run, [("quality", quality), ("size", f"{view.width} x {view.height} pixels")])
         return render_image_page(to_uint8(rgb.cpu()), data.scene.name, facts), quality
-    baked = bake_system(system, subsample_cameras(data), config_to_dict(run.cfg), cells)
-    seen = get_occupied_cells(baked.system) if baked.changes else None
-    compact = compress_system(baked.system, data, baked.config, max_psnr_drop, seen)
-    original_psnr = measure_held_out_psnr(system, data) if baked.changes else compact.psnr_before
+    baked = bake_system(system, data, config_to_dict(run.cfg), cells)
+    compact = compress_system(baked.system, data, baked.config, max_psnr_drop, bool(baked.changes))
+    original_psnr = compact.psnr_before
+    if baked.changes:
+        original_psnr = measure_held_out_psnr(system, data, max_pixels=MAX_BAKED_PIXELS)
     content, changes = strip_local_paths(compact.content), "; ".join(baked.changes)
     size = f"{len(content) / 1000:,.1f} kB, {compact.precision} precision"
     measured = [("held-out PSNR", f"{compact.psnr:.2f} dB"), ("size", size)]
