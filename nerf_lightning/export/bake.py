@@ -1,4 +1,4 @@
-"""Baking fields for web pages: an occupancy grid of what the photos see, and voxels where a page cannot draw the field itself."""
+"""Baking fields for web pages: occupied cells from what the photos see, and voxels where a page cannot draw the field."""
 
 import copy
 import math

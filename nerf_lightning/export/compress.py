@@ -27,7 +27,7 @@ MAX_VISIBILITY_VIEWS = 60
 """Number of training views used to determine visible cells."""
 PRECISIONS = ("byte", "half")
 """Smallest first; "coarse" precedes them for baked systems."""
-MAX_BAKED_PIXELS = 100_000
+MAX_BAKED_PIXELS = 50_000
 """Held-out pixels on which a baked system is compared with the original."""
 MIN_OPACITY = 1e-3
 """Opacity of a sample below which it is empty."""

@@ -74,12 +74,14 @@ def describe_field(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
         near, far = max(bounds.near or 0.0, 0.0), MAX_RAY_DISTANCE if bounds.far is None else bounds.far
     return {
         "kind": "hashes" if hashed else "planes" if isinstance(field, TensoRFField) else "voxels",
-        "levels": [[cells[0], size] for cells, size in zip(field.grid.cells, field.grid.sizes, strict=True)] if hashed else [],
+        "levels": [[cells[0], size] for cells, size in zip(field.grid.cells, field.grid.sizes, strict=True)]
+        if hashed
+        else [],
         "residual": int(hashed and field.view_residual),
         "terms": field.terms,
         "activation": get_activation_id(field),
         "density_lr_scale": field.density_lr_scale if isinstance(field, VoxelField) else 1.0,
-        "least": MIN_SAMPLE_WEIGHT if hashed else MIN_WEIGHT,
+        "least": 2 * MIN_SAMPLE_WEIGHT if hashed else MIN_WEIGHT,
         "background": system.renderer.background.color.tolist(),
         "bounds": {
             "low": bounds.aabb[0].tolist(),
@@ -116,6 +118,7 @@ def render_field_page(
     facts: Sequence[tuple[str, str]],
     photos: Cameras | None = None,
     names: Sequence[str] = (),
+    poster: UInt8[np.ndarray, "H W 3"] | None = None,
 ) -> str:
     """Renders the page's HTML: loads nothing from elsewhere, and escapes all content of the run.
 
@@ -126,9 +129,11 @@ def render_field_page(
         facts: name and value of each.
         photos: cameras of photos, if available.
         names: of the photos.
+        poster: the first view, shown until the page has drawn it.
     """
     about = describe_field(system, orbit)
     about |= {
+        "poster": None if poster is None else encode_data_url(poster, "jpeg"),
         "file": NON_FILENAME_CHARS.sub("_", name) or "field",
         "facts": [list(fact) for fact in facts],
         "photos": None if photos is None else describe_photos(photos, names, torch.tensor(about["focus"])),

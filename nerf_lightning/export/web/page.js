@@ -69,6 +69,7 @@ class Page {
     if (this.dirty) {
       this.dirty = false;
       renderer.draw(this.camera, milliseconds, share);
+      this.canvas.style.background = "none";
       this.drawPhotos();
       this.canvas.dataset.drawn = "coarse";
     } else if (now - this.moved > REST && !renderer.refine(camera, share)) {
@@ -248,6 +249,11 @@ class Page {
 
 async function open() {
   document.body.classList.toggle("framed", window.parent !== window);
+  if (about.poster) {                       // shown while a large shader compiles
+    Object.assign($("view").style, { background: `center / contain no-repeat url(${about.poster})` });
+    $("view").dataset.drawn = "poster";
+    await new Promise(done => requestAnimationFrame(() => setTimeout(done)));
+  }
   const compact = await Compact.read(fromBase64($("compact").textContent));
   const renderer = new Renderer($("view"), compact, about, $("march").textContent), page = new Page(renderer);
   $("view").addEventListener("webglcontextlost", event => { event.preventDefault(); $("view").dataset.drawn = "lost"; });
