@@ -3,6 +3,7 @@
 `set_kernels("reference")` (config key `kernels`) disables all fast versions.
 """
 
+from nerf_lightning.kernels.activation import truncated_exp
 from nerf_lightning.kernels.backend import has_fast_kernel, set_kernels
 from nerf_lightning.kernels.composite import composite, filter_visible, volume_weights
 from nerf_lightning.kernels.harmonics import spherical_harmonics
@@ -11,6 +12,7 @@ from nerf_lightning.kernels.march import cell_index, march, mark_cells, pack_int
 from nerf_lightning.kernels.march_until_opaque import march_until_opaque
 from nerf_lightning.kernels.merge import merge_low_weight
 from nerf_lightning.kernels.mlp import mlp, mlp_heads
+from nerf_lightning.kernels.photometric import composite_over, mean_squared_error, photometric_loss
 from nerf_lightning.kernels.resampling import interval_midpoints, invert_cdf, resample
 from nerf_lightning.kernels.vector_matrix import plane_line_products, plane_line_sum, plane_line_sum_and_products
 from nerf_lightning.kernels.voxels import (
@@ -26,6 +28,7 @@ __all__ = [
     "interval_midpoints",
     "cell_index",
     "composite",
+    "composite_over",
     "march_until_opaque",
     "has_fast_kernel",
     "hash_interpolate",
@@ -36,10 +39,12 @@ __all__ = [
     "march",
     "mark_cells",
     "mark_rows",
+    "mean_squared_error",
     "merge_low_weight",
     "mlp",
     "mlp_heads",
     "pack_intervals",
+    "photometric_loss",
     "plane_line_products",
     "plane_line_sum",
     "plane_line_sum_and_products",
@@ -47,6 +52,7 @@ __all__ = [
     "interpolate_voxels",
     "resample",
     "total_variation",
+    "truncated_exp",
     "spherical_harmonics",
     "set_kernels",
     "volume_weights",

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.kernels import cpu, gpu
@@ -13,10 +13,10 @@ from nerf_lightning.kernels.segment_sums import exclusive_sum
 
 CompositedRays = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
 """Weighted sums of color, opacity and distance along each ray."""
-VisibleSamples = tuple[
-    Float[Tensor, "K"], tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
-]
-"""Optical depth of the K kept samples of N, and their `Packed` intervals."""
+PackedSelection = tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
+"""`Packed` intervals of K samples of N."""
+VisibleSamples = tuple[Float[Tensor, "K"], PackedSelection, Bool[Tensor, "R"] | None]
+"""Optical depth and intervals of the kept samples and, with a capacity, whether a ray has all: given and kept ones fitted."""
 
 
 def volume_weights(
@@ -111,11 +111,12 @@ def filter_visible_reference(
     if capacity is None:
         index, kept = keep.nonzero()[:, 0], counts.index_select(0, offsets)
         depths, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
-        return depths, (t, dt, ray, kept)
+        return depths, (t, dt, ray, kept), None
     index, is_real = first_true_indices(capacity, counts)
     kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # a ray may end beyond the earlier call's capacity
+    complete = (offsets[1:] <= len(keep)) & (kept[1:] <= capacity)
     depths, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
-    return depths * is_real, (t, dt * is_real, ray, kept)
+    return depths * is_real, (t, dt * is_real, ray, kept), complete
 
 
 def filter_visible(
@@ -149,4 +150,4 @@ def filter_visible(
     kept = offsets_from_counts(counts)
     out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
     cpu.composite.pack_visible(keep, offsets, kept, optical_depth, t, dt, out, rays)
-    return out[0], (out[1], out[2], rays, kept)
+    return out[0], (out[1], out[2], rays, kept), None

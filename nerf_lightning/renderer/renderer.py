@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
@@ -25,29 +25,30 @@ FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], FieldOutput | t
 class RenderOutput:
     """Rendered rays."""
 
-    rgb: Float[Tensor, "R 3"]
-    """Color composited onto the background."""
+    foreground: Float[Tensor, "R 3"]
+    """Color without background."""
     opacity: Float[Tensor, "R"]
     """Accumulated opacity in [0, 1]."""
     distance: Float[Tensor, "R"]
     """Depth times opacity, world units."""
+    backgrounds: Float[Tensor, "R 3"] | None = None
+    """Color behind each ray; None: black."""
     weights: Float[Tensor, "N"] | None = None
     """Rendering weights with gradient; None if no loss needs them."""
     view_residual: Float[Tensor, "N 3"] | None = None
     """See `FieldOutput`."""
 
     @property
+    def rgb(self) -> Float[Tensor, "R 3"]:
+        """Color composited onto the background."""
+        if self.backgrounds is None:
+            return self.foreground
+        return torch.addcmul(self.foreground, (1 - self.opacity)[:, None], self.backgrounds)
+
+    @property
     def depth(self) -> Float[Tensor, "R"]:
         """Depth along the ray, world units: the mean, for unbounded scenes the median; 0 where opacity is 0."""
         return self.distance / self.opacity.clamp_min(1e-6)
-
-
-def composite_over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-    """Composites photo pixels with straight alpha (C = 4) onto backgrounds; returns RGB in [0, 1]."""
-    colors = (pixels / 255).to(backgrounds.dtype)
-    if colors.shape[1] == 3:
-        return colors
-    return torch.lerp(backgrounds, colors[:, :3], colors[:, 3:])
 
 
 def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], samples: Samples) -> Float[Tensor, "R"]:
@@ -122,12 +123,11 @@ class VolumeRenderer(torch.nn.Module):
         if self.unbounded and not has_gradient:
             # Median for unbounded scenes: 1 % of stray weight at the far plane would dominate the mean.
             distance = opacity * median_depth(density, opacity, samples)
-        color = torch.addcmul(foreground, (1 - opacity)[:, None], backgrounds)
         has_losses = self.distortion_loss_weight or self.near_loss_weight or self.view_loss_weight
         if not (self.training and has_gradient and (has_losses or samples.proposals is not None)):
-            return RenderOutput(color, opacity, distance)  # a full view has too many samples to keep
+            return RenderOutput(foreground, opacity, distance, backgrounds)  # a full view has too many samples to keep
         weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-        return RenderOutput(color, opacity, distance, weights, view_residual)
+        return RenderOutput(foreground, opacity, distance, backgrounds, weights, view_residual)
 
     def losses(
         self, output: RenderOutput, samples: Samples, progress: float, texturelessness: Float[Tensor, "R"] | None = None
