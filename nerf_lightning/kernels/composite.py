@@ -20,7 +20,11 @@ VisibleSamples = tuple[Float[Tensor, "K"], PackedSelection, Bool[Tensor, "R"] | 
 
 
 def volume_weights(
-    density: Float[Tensor, "N"], dt: Float[Tensor, "N"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
+    density: Float[Tensor, "N"],
+    dt: Float[Tensor, "N"],
+    ray: Int[Tensor, "N"],
+    offsets: Int[Tensor, "R_plus_1"],
+    per_ray: int | None = None,
 ) -> Float[Tensor, "N"]:
     """Rendering weights w_i = T_i (1 - exp(-sigma_i dt_i)) with transmittance T_i = exp(-sum_{j < i} sigma_j dt_j).
 
@@ -29,12 +33,20 @@ def volume_weights(
         dt: interval lengths, world units.
         ray: ray of each sample, ascending.
         offsets: first sample of each ray, then N.
+        per_ray: samples of each ray, if all have as many.
 
     Returns:
         Weights in [0, 1]; their sum over a ray is its opacity.
     """
+    if per_ray and has_gpu_kernel(density, constants=(dt,)) and gpu.resampling.is_supported(dt.view(-1, per_ray)):
+        return gpu.resampling.IntervalWeights.apply(density, dt.view(-1, per_ray), 0.0, 1.0).flatten()
     exponent = -density * dt
     return -torch.exp(exclusive_sum(exponent, ray, offsets)) * torch.expm1(exponent)
+
+
+def interval_weights(optical_depth: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+    """Rendering weights from optical depths (density times length), see `volume_weights`."""
+    return torch.exp(optical_depth - optical_depth.cumsum(1)) * -torch.expm1(-optical_depth)
 
 
 def composite_reference(

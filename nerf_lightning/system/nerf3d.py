@@ -246,8 +246,8 @@ class NeRF3D(System):
             for span, part in split_by_rays(samples.merge_low_weight_samples(), self.chunk):
                 outputs.append(self.renderer(chunk[span], part, self.field, color.expand(len(chunk[span]), 3)))
         names = ("foreground", "opacity", "distance")
-        rendered = (torch.cat([getattr(output, name) for output in outputs]) for name in names)
-        return RenderOutput(*rendered, color.expand(len(rays), 3))
+        foreground, opacity, distance = (torch.cat([getattr(output, name) for output in outputs]) for name in names)
+        return RenderOutput(foreground, opacity, distance, color.expand(len(rays), 3))
 
     @property
     def background(self) -> list[float]:
