@@ -50,7 +50,8 @@ def build_page(
         quality = f"PSNR {measure_held_out_psnr(system, data):.2f} dB"
         facts = describe_run(source, run, [("quality", quality), ("size", f"{view.width} x {view.height} pixels")])
         return render_image_page(to_uint8(rgb.cpu()), data.scene.name, facts), quality
-    baked = bake_system(system, data, config_to_dict(run.cfg), cells)
+    posed: Any = data
+    baked = bake_system(system, posed, config_to_dict(run.cfg), cells)
     compact = compress_system(baked.system, data, baked.config, max_psnr_drop, bool(baked.changes))
     original_psnr = compact.psnr_before
     if baked.changes:

@@ -66,7 +66,7 @@ def describe_field(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
     """
     field, sampler = system.field, system.sampler
     assert isinstance(field, DrawableField) and isinstance(sampler, OccupancySampler)
-    hashed = isinstance(field, HashGridField)
+    hashed = field if isinstance(field, HashGridField) else None
     bounds = sampler.bounds.to("cpu")
     if bounds.unbounded:  # equal for all rays
         near, far = (float(end) for end in bounds.near_far(Rays(torch.zeros(1, 3), torch.zeros(1, 3))))
@@ -74,14 +74,14 @@ def describe_field(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
         near, far = max(bounds.near or 0.0, 0.0), MAX_RAY_DISTANCE if bounds.far is None else bounds.far
     return {
         "kind": "hashes" if hashed else "planes" if isinstance(field, TensoRFField) else "voxels",
-        "levels": [[cells[0], size] for cells, size in zip(field.grid.cells, field.grid.sizes, strict=True)]
+        "levels": [[cells[0], size] for cells, size in zip(hashed.grid.cells, hashed.grid.sizes, strict=True)]
         if hashed
         else [],
-        "residual": int(hashed and field.view_residual),
+        "residual": int(hashed is not None and hashed.view_residual),
         "terms": field.terms,
         "activation": get_activation_id(field),
         "density_lr_scale": field.density_lr_scale if isinstance(field, VoxelField) else 1.0,
-        "least": 2 * MIN_SAMPLE_WEIGHT if hashed else MIN_WEIGHT,
+        "least": MIN_SAMPLE_WEIGHT if hashed else MIN_WEIGHT,
         "background": system.renderer.background.color.tolist(),
         "bounds": {
             "low": bounds.aabb[0].tolist(),

@@ -28,7 +28,7 @@ from nerf_lightning.utils.parsing import VALUE_ERRORS, parse_json, read_file, re
 FORMAT, VERSION = "nerf_lightning compact", 1
 MIN_QUANTIZED_SIZE = 2048
 """Minimum number of entries of an array stored as uint8; smaller ones, such as networks, stay float16."""
-COARSE_STEP = 0.2
+COARSE_STEP = 0.25
 """Quantization step of the "coarse" precision, in standard deviations of a column: few distinct codes, which compress well."""
 MAX_HEADER_BYTES = 16 << 20
 """Limit for the decompressed JSON, which takes up to 32 times the memory; a thousand cameras are 4 MB."""
