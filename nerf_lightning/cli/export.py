@@ -124,7 +124,7 @@ def export_html(
     *,
     all: bool = False,
     cells: GridSize | None = None,
-    max_psnr_drop: MaxPsnrDrop = 0.1,
+    max_psnr_drop: MaxPsnrDrop = 0.15,
     output: Output = None,
     photos: Photos = None,
     device: Device = "auto",
