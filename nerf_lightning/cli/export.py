@@ -124,14 +124,14 @@ def export_html(
     *,
     all: bool = False,
     cells: GridSize | None = None,
-    max_psnr_drop: MaxPsnrDrop = 0.1,
+    max_psnr_drop: MaxPsnrDrop = 0.15,
     output: Output = None,
     photos: Photos = None,
     device: Device = "auto",
 ) -> Path:
     """Write a self-contained interactive HTML viewer that works offline in any browser.
 
-    TensoRF and voxel fields are rendered directly; others are baked into voxels, which takes minutes.
+    TensoRF, hash-grid and voxel fields are drawn directly; others are baked into voxels.
 
     Args:
         all: Write a page for each run in a folder, and gallery.html with all of them side by side.

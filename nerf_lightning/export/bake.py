@@ -1,4 +1,4 @@
-"""Baking fields for web pages: TensoRF or voxels, with an occupancy grid."""
+"""Baking fields for web pages: occupied cells from what the photos see, and voxels where a page cannot draw the field."""
 
 import copy
 import math
@@ -8,20 +8,30 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, Rays
-from nerf_lightning.export.compress import MIN_OPACITY, CellMask, find_visible_cells
+from nerf_lightning.cameras import Bounds, Cameras
+from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.dataset.ray_datamodule import make_batch
+from nerf_lightning.export.compress import MIN_OPACITY, CellMask, subsample_cameras
 from nerf_lightning.export.volume import MAX_RESOLUTION, MIN_RESOLUTION
-from nerf_lightning.model import TensoRFField, VoxelField
+from nerf_lightning.kernels import volume_weights
+from nerf_lightning.model import Field, HashGridField, TensoRFField, VoxelField
 from nerf_lightning.model.layers.encoding import encode_directions
 from nerf_lightning.model.layers.grid_masks import dilate, vertices_of_cells
 from nerf_lightning.model.voxels import EMPTY_LOG_DENSITY
+from nerf_lightning.renderer import composite_over
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.progress import track_progress
 from nerf_lightning.utils.text import subsample
 
-GRID_RESOLUTION, STEPS_PER_RAY = 128, 192
-"""Occupancy grid cells per axis, and steps per ray, that replace another sampler."""
+GRID_RESOLUTION = 128
+"""Cells per axis of an occupancy grid that replaces another sampler."""
+STEPS_PER_RAY, UNBOUNDED_STEPS_PER_RAY = 192, 384
+"""Steps per ray between its cells."""
+MAX_VISIBILITY_RAYS = 150_000
+"""Rays over all views by which cells are weighed."""
+WEIGHT_SHARE = 0.97
+"""Share of the rendering weight that the occupied cells hold, before their dilation."""
 SH_DEGREE, MAX_DIRECTIONS = 1, 24
 """Degree of the spherical harmonics baked from a field, and number of view directions they are fitted to."""
 RIDGE_DAMPING = 1e-2
@@ -32,8 +42,8 @@ MAX_VERTICES = 700_000
 """Limit for kept vertices (about 6 MB), unless the user sets the resolution."""
 CUBE_MARGIN = 1e-4
 """Margin at the unit cube's faces, which are infinitely far in an unbounded scene."""
-DISTILL_STEPS, DISTILL_RAYS, DISTILL_LR = 400, 4096, 0.05
-"""Distillation steps, rays per step, and Adam's learning rate."""
+POLISH_STEPS, POLISH_RAYS, POLISH_LR = 200, 4096, 0.05
+"""Training steps of baked voxels, rays per step, and Adam's learning rate."""
 CHUNK_VERTICES = 1 << 14
 """Vertices per batch."""
 
@@ -48,17 +58,24 @@ class BakedSystem(NamedTuple):
     """Descriptions of replaced parts; if any, the occupied cells are those visible to the cameras."""
 
 
+def is_drawable(field: Field) -> bool:
+    """Whether a web page can draw a field."""
+    if isinstance(field, HashGridField):
+        return field.grid.tables.shape[1] == 2
+    return isinstance(field, TensoRFField | VoxelField)
+
+
 def is_web_renderable(system: NeRF3D) -> bool:
     """Whether a web page can render a system unchanged."""
-    return isinstance(system.field, TensoRFField | VoxelField) and isinstance(system.sampler, OccupancySampler)
+    return is_drawable(system.field) and isinstance(system.sampler, OccupancySampler)
 
 
-def bake_system(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells: int | None) -> BakedSystem:
-    """Returns the system if a page can render it, else a copy with a voxel field, an occupancy sampler, or both.
+def bake_system(system: NeRF3D, data: RayDataModule, config: dict[str, Any], cells: int | None) -> BakedSystem:
+    """Returns the system if a page can render it, else a copy with an occupancy sampler, a voxel field, or both.
 
     Args:
         system: trained.
-        cameras: training views; what they see is kept.
+        data: of its run; what the training views see is kept.
         config: of its run, as plain values.
         cells: voxels per axis of a baked field; None takes the photos' resolution, within limits.
     """
@@ -66,27 +83,27 @@ def bake_system(system: NeRF3D, cameras: Cameras, config: dict[str, Any], cells:
     changes: list[str] = []
     if is_web_renderable(system):
         return BakedSystem(system, config, changes)
-    field, sampler = system.field, system.sampler
-    keeps_field, keeps_sampler = isinstance(field, TensoRFField | VoxelField), isinstance(sampler, OccupancySampler)
+    field, sampler, cameras = system.field, system.sampler, subsample_cameras(data)
     baked = copy.copy(system)
     baked._modules = dict(system._modules)  # replaces modules of the copy only
     grid = sampler.grid.resolution if isinstance(sampler, OccupancySampler) else GRID_RESOLUTION
-    if keeps_field:
-        seen = dilate(find_visible_cells(system, cameras, grid))
+    if is_drawable(field):
+        seen = find_weighty_cells(system, cameras, grid)
     else:
         baked.field, options = bake_voxels(system, cameras, cells)
         config["model"] = describe_target(VoxelField, **options)
         changes.append(f"voxels, {baked.field.side - 1} a side, in place of its own field")
         seen = resample_occupancy(baked.field, grid)
-    if not keeps_sampler:
-        config["sampler"] = describe_target(OccupancySampler, samples=STEPS_PER_RAY, resolution=GRID_RESOLUTION)
-        changes.append(f"{STEPS_PER_RAY} steps between {GRID_RESOLUTION} cells a side in place of its own samples")
-    steps = OccupancySampler(field.bounds, STEPS_PER_RAY, GRID_RESOLUTION, chunk=system.chunk)
-    baked.sampler = copy.deepcopy(sampler) if keeps_sampler else steps
+    if not isinstance(sampler, OccupancySampler):
+        steps = UNBOUNDED_STEPS_PER_RAY if field.bounds.unbounded else STEPS_PER_RAY
+        config["sampler"] = describe_target(OccupancySampler, samples=steps, resolution=grid)
+        changes.append(f"{steps} steps between {grid} cells a side in place of its own samples")
+        sampler = OccupancySampler(field.bounds, steps, grid, chunk=system.chunk)
+    baked.sampler = copy.deepcopy(sampler)
     baked.sampler.import_state({"grid.occupied": seen.flatten()})
     baked.sampler.to(system.device)
-    if not keeps_field:
-        distill(baked, system, cameras)
+    if baked.field is not field:
+        polish(baked, data)
     return BakedSystem(baked, config, changes)
 
 
@@ -104,7 +121,7 @@ def bake_voxels(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
     """
     bounds = system.field.bounds
     across = cells or min(max(math.ceil(min(bounds.unit_cube_pixels, MAX_RESOLUTION)), MIN_RESOLUTION), MAX_RESOLUTION)
-    seen = dilate(find_visible_cells(system, cameras, across))
+    seen = find_weighty_cells(system, cameras, across)
     while True:
         options: dict[str, Any] = {"base_resolution": across, "max_resolution": across, "stages": 1}
         options |= {"degree": SH_DEGREE, "size": "fixed"}
@@ -130,25 +147,45 @@ def bake_voxels(system: NeRF3D, cameras: Cameras, cells: int | None) -> tuple[Vo
     return voxels, options
 
 
-def distill(baked: NeRF3D, system: NeRF3D, cameras: Cameras) -> None:
-    """Trains the baked field on renders of the original, to recover detail between vertices."""
-    rays, colors = [], []
+@torch.no_grad()
+def find_weighty_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
+    """Cells of an n^3 grid over the bounds that hold most of the rendering weight of the cameras' rays, and their neighbors."""
+    bounds = system.field.bounds
+    pixels = int(cameras.sizes.prod(1).sum())
+    cameras = cameras.rescale(min(1.0, math.sqrt(MAX_VISIBILITY_RAYS / pixels)))
+    sums = torch.zeros(n**3, device=system.device)
     for view in track_progress(range(len(cameras)), len(cameras), "views"):
-        rays.append(cameras.generate_view_rays(view))
+        rays = cameras.generate_view_rays(view)
+        for start in range(0, len(rays), system.chunk_rays):
+            chunk = rays[start : start + system.chunk_rays].to(system.device)
+            samples = system.sampler(chunk, system.field.density)
+            density = system.field.density(samples.positions(chunk))
+            weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
+            for end in (-0.5, 0.0, 0.5):  # an interval may cross cells
+                along = chunk.directions[samples.ray] * (samples.t + end * samples.dt)[:, None]
+                cell = (bounds.to_unit(chunk.origins[samples.ray] + along) * n).long().clamp(0, n - 1)
+                x, y, z = cell.unbind(1)
+                sums.index_add_(0, (x * n + y) * n + z, weights)
+    ordered, order = sums.sort(descending=True)
+    held = ordered.double().cumsum(0)
+    mask = torch.zeros(n**3, dtype=torch.bool, device=system.device)
+    mask[order] = (held <= WEIGHT_SHARE * held[-1]) & (ordered > 0)
+    return dilate(mask.view(n, n, n))
+
+
+def polish(baked: NeRF3D, data: RayDataModule) -> None:
+    """Trains a baked field on the photos, to recover detail between vertices."""
+    photos, color = data.scene.train, baked.renderer.background.color
+    generator = torch.Generator().manual_seed(baked.seed)
+    optimizer = torch.optim.Adam(baked.field.parameters(), POLISH_LR, (0.5, 0.99))
+    for step in track_progress(range(POLISH_STEPS), POLISH_STEPS, "steps"):
+        optimizer.param_groups[0]["lr"] = POLISH_LR * (1 + math.cos(math.pi * step / POLISH_STEPS)) / 2
+        batch = make_batch(photos, photos.sample_pixels(POLISH_RAYS, generator)).to(baked.device)
         with torch.no_grad():
-            colors.append(system.render(rays[-1].to(system.device)).rgb.cpu())
-    origins, directions = torch.cat([r.origins for r in rays]), torch.cat([r.directions for r in rays])
-    targets = torch.cat(colors)
-    generator = torch.Generator(system.device).manual_seed(system.seed)
-    optimizer = torch.optim.Adam(baked.field.parameters(), DISTILL_LR, (0.5, 0.99))
-    for step in track_progress(range(DISTILL_STEPS), DISTILL_STEPS, "steps"):
-        optimizer.param_groups[0]["lr"] = DISTILL_LR * (1 + math.cos(math.pi * step / DISTILL_STEPS)) / 2
-        chosen = torch.randint(len(targets), (DISTILL_RAYS,), generator=generator, device=system.device).cpu()
-        batch = Rays(origins[chosen], directions[chosen]).to(system.device)
-        with torch.no_grad():
-            samples = baked.sampler(batch, baked.field.density, None)
-        rendered = baked.renderer(batch, samples, baked.field)
-        loss = (rendered.rgb - targets[chosen].to(system.device)).square().mean()
+            samples = baked.sampler(batch.rays, baked.field.density, None)
+        rendered = baked.renderer(batch.rays, samples, baked.field)
+        truth = composite_over(batch.pixels, color.expand(len(batch.pixels), 3))
+        loss = (rendered.rgb - truth).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Cameras
 from nerf_lightning.dataset import DataModule
+from nerf_lightning.dataset.pixel_subset import make_subset
 from nerf_lightning.errors import InputError
 from nerf_lightning.model.layers.grid_masks import dilate
 from nerf_lightning.runs.compact import decode_run, encode_system
@@ -25,7 +26,9 @@ from nerf_lightning.utils.text import subsample
 MAX_VISIBILITY_VIEWS = 60
 """Number of training views used to determine visible cells."""
 PRECISIONS = ("byte", "half")
-"""Smallest first."""
+"""Smallest first; "coarse" precedes them for baked systems."""
+MAX_BAKED_PIXELS = 50_000
+"""Held-out pixels on which a baked system is compared with the original."""
 MIN_OPACITY = 1e-3
 """Opacity of a sample below which it is empty."""
 MAX_RAYS_PER_PIXEL_SIDE = 8
@@ -95,10 +98,20 @@ class CompactFile:
         return self.psnr_before - self.psnr
 
 
-def measure_held_out_psnr(system: System, data: DataModule, views: Sequence[int] | None = None) -> float:
-    """Mean PSNR over held-out views with known pixels, dB (all views for None); NaN if there is none."""
+def measure_held_out_psnr(
+    system: System, data: DataModule, views: Sequence[int] | None = None, max_pixels: float = math.inf
+) -> float:
+    """Mean PSNR over held-out views with known pixels, dB (all views for None); NaN if there is none.
+
+    Args:
+        system: trained.
+        data: of its run.
+        views: indices of held-out views.
+        max_pixels: number of (evenly spaced) pixels over all views.
+    """
     chosen = range(data.num_held_out_views) if views is None else views
-    results = system.evaluate_held_out(data, track_progress(chosen, len(chosen), "held-out views"))
+    subset = make_subset(sum(map(data.count_held_out_pixels, chosen)), max_pixels)
+    results = system.evaluate_held_out(data, track_progress(chosen, len(chosen), "held-out views"), subset)
     finite = [result.psnr for result in results if math.isfinite(result.psnr)]  # fully masked views have none
     return fmean(finite) if finite else math.nan
 
@@ -110,7 +123,7 @@ def subsample_cameras(data: DataModule, max_views: int = MAX_VISIBILITY_VIEWS) -
 
 
 def compress_system(
-    system: Any, data: DataModule, config: dict[str, Any], max_psnr_drop: float, seen: CellMask | None = None
+    system: Any, data: DataModule, config: dict[str, Any], max_psnr_drop: float, is_baked: bool = False
 ) -> CompactFile:
     """Encodes a system in the fewest bytes within `max_psnr_drop`: first only visible cells, then all.
 
@@ -119,24 +132,25 @@ def compress_system(
         data: of its run.
         config: of its run, as plain values.
         max_psnr_drop: on held-out views, dB.
-        seen: occupied cells visible to the training cameras, if known.
+        is_baked: whether `bake_system` has removed what the training cameras do not see.
 
     Raises:
         InputError: every precision loses more.
     """
-    before = measure_held_out_psnr(system, data)
-    if seen is None and data.is_posed:
-        seen = find_seen_cells(system, subsample_cameras(data))
+    precisions, pixels = (("coarse", *PRECISIONS), MAX_BAKED_PIXELS) if is_baked else (PRECISIONS, math.inf)
+    before = measure_held_out_psnr(system, data, max_pixels=pixels)
+    seen = None if is_baked or not data.is_posed else find_seen_cells(system, subsample_cameras(data))
     occupied = get_occupied_cells(system)
     same_cells = seen is None or occupied is None or torch.equal(seen, occupied)
     candidates = [prune_to_cells(system, cells) for cells in ([seen] if same_cells else [seen, occupied])]
     scene = scene_to_dict(data)
     attempts: list[CompactFile] = []
-    for precision in PRECISIONS:
+    for precision in precisions:
         for part in candidates:  # held-out views may see more than few photos do
             content = encode_system(part, precision, config, scene)
             small = decode_run(content, "compact", system.device).system
-            attempts.append(CompactFile(content, precision, measure_held_out_psnr(small, data), before))
+            psnr = measure_held_out_psnr(small, data, max_pixels=pixels)
+            attempts.append(CompactFile(content, precision, psnr, before))
             if attempts[-1].psnr_drop <= max_psnr_drop:
                 return attempts[-1]
     best = min(attempts, key=lambda compact: compact.psnr_drop)

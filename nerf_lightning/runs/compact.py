@@ -28,6 +28,8 @@ from nerf_lightning.utils.parsing import VALUE_ERRORS, parse_json, read_file, re
 FORMAT, VERSION = "nerf_lightning compact", 1
 MIN_QUANTIZED_SIZE = 2048
 """Minimum number of entries of an array stored as uint8; smaller ones, such as networks, stay float16."""
+COARSE_STEP = 0.25
+"""Quantization step of the "coarse" precision, in standard deviations of a column: few distinct codes, which compress well."""
 MAX_HEADER_BYTES = 16 << 20
 """Limit for the decompressed JSON, which takes up to 32 times the memory; a thousand cameras are 4 MB."""
 Arrays = dict[str, Any]  # of numpy arrays
@@ -38,7 +40,7 @@ def encode_system(system: System, precision: str, config: dict[str, Any], scene:
 
     Args:
         system: trained; `prune_to_cells` removes what no camera sees.
-        precision: "half" or "byte".
+        precision: "half", "byte" or "coarse".
         config, scene: of its run, see `runs.folder`.
     """
     arrays: Arrays = {}
@@ -47,16 +49,16 @@ def encode_system(system: System, precision: str, config: dict[str, Any], scene:
     for part, module in system.exportable_modules.items():
         for name, tensor in module.export_state().items():
             code = "bits" if tensor.dtype == torch.bool else "half" if name in learned else "exact"
-            if code == "half" and precision == "byte" and tensor.numel() >= MIN_QUANTIZED_SIZE:
+            if code == "half" and precision != "half" and tensor.numel() >= MIN_QUANTIZED_SIZE:
                 code = "byte"
             key = f"{part}.{name}"
             codes[key] = {"code": code, "shape": list(tensor.shape)}
-            arrays |= _quantize(key, tensor.detach().cpu().numpy(), code)
+            arrays |= _quantize(key, tensor.detach().cpu().numpy(), code, precision == "coarse")
     header = {"format": FORMAT, "version": VERSION, "config": config, "scene": scene, "arrays": codes}
     return _pack(header, arrays)
 
 
-def _quantize(name: str, array: np.ndarray, code: str) -> Arrays:
+def _quantize(name: str, array: np.ndarray, code: str, is_coarse: bool) -> Arrays:
     if code == "bits":
         return {name: np.packbits(array.reshape(-1))}
     if code == "half":
@@ -68,6 +70,10 @@ def _quantize(name: str, array: np.ndarray, code: str) -> Arrays:
     rows = array.reshape(len(array), -1) if array.ndim < 3 else array.reshape(-1, array.shape[-1])
     used = rows[rows.any(1)] if rows.any() else rows
     low, high = used.min(0), used.max(0)
+    if is_coarse:
+        step = COARSE_STEP * used.std(0)
+        low = np.maximum(low, used.mean(0) - 127 * step)
+        high = low + 255 * step
     step = np.where(high > low, (high - low) / 255, 1)
     codes = np.rint((rows.clip(low, high) - low) / step).astype(np.uint8)
     codes[~rows.any(1)] = 0  # equal values compress well

@@ -106,7 +106,7 @@ def seen_through(page: Any, cameras: Cameras, view: int) -> np.ndarray:
 
 @pytest.mark.parametrize(
     ("recipe", "precision", "unbounded"),
-    [("tensorf", "half", True), ("voxels", "byte", False)],
+    [("tensorf", "half", True), ("voxels", "byte", False), ("hashgrid", "coarse", True)],
 )
 def test_render_field_page_matches_renderer(recipe: str, precision: str, unbounded: bool, browser: Any, tmp_path: Path):
     text, run = page_of(made(recipe, precision, unbounded))

@@ -71,7 +71,7 @@ def test_compact_file_renders_like_the_run_in_fewer_bytes(given: tuple[str, ...]
 
 def test_compress_system_excessive_psnr_drop_raises(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     scores = iter([30.0, 29.5, 29.6, 29.7, 29.4])
-    monkeypatch.setattr(compress, "measure_held_out_psnr", lambda *_: next(scores))
+    monkeypatch.setattr(compress, "measure_held_out_psnr", lambda *_, **__: next(scores))
     monkeypatch.setattr(compress, "find_seen_cells", lambda system, _: compress.get_occupied_cells(system) & False)
     with pytest.raises(InputError, match=r"0\.30 dB lost, expected at most 0\.1 dB"):
         compress.compress_system(*make_run(tmp_path, "recipe=hashgrid_small"), 0.1)

@@ -1,8 +1,9 @@
 // Ray marching, one ray per pixel, with the algorithm and names of sampler/occupancy.py and renderer/renderer.py. The page prepends
-// #version and constants: PLANES or VOXELS, UNBOUNDED, TERMS, ... and EACH_INPUT(F), which is F(0) F(1) ..., as loops over arrays are
+// #version and constants: PLANES, HASHES or neither (voxels), UNBOUNDED, TERMS, ... and EACH_INPUT(F), which is F(0) F(1) ..., as loops over arrays are
 // slow without a GPU. Positions are in the unit cube, distances in world units.
 precision highp float;
 precision highp int;
+precision highp sampler2D;
 precision highp sampler3D;
 precision highp sampler2DArray;
 precision highp usampler3D;
@@ -100,6 +101,68 @@ vec3 colorAt(vec3 unit) {
   EACH_NEURON(NEURON)
   return sigmoid(logits);
 }
+#elif defined(HASHES)
+// A multiresolution hash grid (kernels/hashgrid.py) and two networks, four neurons at a time (kernels/mlp.py).
+uniform sampler2D tables;                   // two features of each entry, level after level
+uniform vec4 tableRange;                    // low and span of either
+const vec4 network[] = NETWORK;             // layer after layer; constant indices only, as for planes
+#define MATRIX(w) mat4(network[w], network[w + 1], network[w + 2], network[w + 3])
+
+// Features of a level. last: the hash's mask, 0 where each vertex has an entry of its own.
+vec2 level(vec3 unit, float side, uvec3 factors, uint last, uint first) {
+  vec3 place = clamp(unit, 0.0, 1.0) * side, cell = min(floor(place), side - 1.0), part = place - cell;
+  uvec3 low = uvec3(cell) * factors, high = low + factors;
+#define ENTRY(a, b, c) entry = first + (last == 0u ? a.x + b.y + c.z : (a.x ^ b.y ^ c.z) & last), \
+  texelFetch(tables, ivec2(entry % TABLE_WIDTH, entry / TABLE_WIDTH), 0).rg
+#define EDGE(b, c) mix((ENTRY(low, b, c)), (ENTRY(high, b, c)), part.x)
+  uint entry;
+  vec2 near = mix(EDGE(low, low), EDGE(high, low), part.y), away = mix(EDGE(low, high), EDGE(high, high), part.y);
+  return tableRange.xy + tableRange.zw * mix(near, away, part.z);
+}
+
+vec4 geometry[OUTPUTS];                     // of the density network: raw density, then inputs of the color network
+float rawDensity(vec3 unit) {
+  vec4 encoded[INPUTS];
+  ENCODE
+#define BEGIN(k) geometry[k] = network[SECOND + k * (1 + 4 * NEURONS)];
+  EACH_OUTPUT(BEGIN)
+#define ENTER(i) hidden += MATRIX(w + 4 * i) * encoded[i];
+#define LEAVE(k) geometry[k] += MATRIX(to + k * (1 + 4 * NEURONS)) * hidden;
+#define NEURON(j) { \
+    const int w = j * (1 + 4 * INPUTS) + 1, to = SECOND + 1 + 4 * j; \
+    vec4 hidden = network[w - 1]; \
+    EACH_INPUT(ENTER) \
+    hidden = max(hidden, 0.0); \
+    EACH_OUTPUT(LEAVE) \
+  }
+  EACH_NEURON(NEURON)
+  return geometry[0].x;
+}
+
+vec4 alongRay[NEURONS];                     // bias and direction terms of each four neurons: constant along the ray
+void prepare() {
+#define TERM(t) + harmonics[t] * network[w + t]
+#define ALONG(j) { const int w = THIRD + j * (1 + TERMS + 4 * OUTPUTS) + 1; alongRay[j] = network[w - 1] EACH_TERM(TERM); }
+  EACH_NEURON(ALONG)
+}
+
+vec3 colorAt(vec3 unit) {                   // at the position of the last rawDensity
+  vec4 first[NEURONS];
+#define FROM(k) hidden += MATRIX(w + 4 * k) * geometry[k];
+#define FIRST(j) { const int w = THIRD + j * (1 + TERMS + 4 * OUTPUTS) + 1 + TERMS; vec4 hidden = alongRay[j]; EACH_OUTPUT(FROM) first[j] = max(hidden, 0.0); }
+  EACH_NEURON(FIRST)
+  vec3 logits = network[FOURTH + NEURONS * (4 + 4 * NEURONS)].rgb + RESIDUAL * geometry[0].gba;
+#define ADD(i) hidden += MATRIX(w + 4 * i) * first[i];
+#define NEXT(j) { \
+    const int w = FOURTH + j * (4 + 4 * NEURONS) + 1, last = w + 4 * NEURONS; \
+    vec4 hidden = network[w - 1]; \
+    EACH_HIDDEN(ADD) \
+    hidden = max(hidden, 0.0); \
+    logits += vec3(dot(network[last], hidden), dot(network[last + 1], hidden), dot(network[last + 2], hidden)); \
+  }
+  EACH_NEURON(NEXT)
+  return sigmoid(logits);
+}
 #else
 // A sparse voxel grid (kernels/voxels.py) as bricks of 8 x 8 x 8 vertices that share a side with their neighbors: filtering never
 // leaves a brick. Part 0 of the atlas holds log-density and color, part 1 + b the coefficients of harmonic 1 + b.
@@ -174,7 +237,7 @@ void main() {
   prepare();
 
   vec3 summed = vec3(0);
-  float light = 1.0, opacity = 0.0, reach = 0.0;          // light: transmittance
+  float light = 1.0, opacity = 0.0, reach = 0.0, pending = 0.0;   // light: transmittance; pending: weight without a color yet
   for (int k = 0; k <= SAMPLES; k++) {
 #ifdef UNBOUNDED
     float start = edge;
@@ -198,13 +261,18 @@ void main() {
     }
     if (any(lessThan(unit, keepLow)) || any(greaterThan(unit, keepHigh))) continue;
     float through = exp(-density(rawDensity(unit)) * (end - start)), weight = light * (1.0 - through);
-    if (weight > LEAST && shown == 0) summed += weight * colorAt(unit);
+    pending += weight;
+    if (pending > LEAST && shown == 0) {                  // faint samples take the color of the next
+      summed += pending * colorAt(unit);
+      pending = 0.0;
+    }
     if (opacity < 0.5 && opacity + weight >= 0.5) reach = t;   // median depth, as for unbounded scenes
     opacity += weight;
     light *= through;
     if (light < STOP) break;
   }
 
+  if (opacity > pending) summed *= opacity / (opacity - pending);
   if (shown == 0) pixel = vec4(summed + (1.0 - opacity) * background.rgb * background.a, opacity + (1.0 - opacity) * background.a);
   else if (shown == 1) pixel = vec4(vec3(reach > 0.0 ? clamp((shades.y - reach) / (shades.y - shades.x), 0.05, 1.0) : 0.0), 1);
   else if (shown == 2) pixel = vec4(vec3(opacity), 1);

@@ -39,10 +39,22 @@ class Page {
       this.turntable(false);
       this.flight = null;
       this.touched = true;
+      this.stay();
     }
     if (by !== "message" && by !== "turntable" && window.parent !== window) parent.postMessage({ kind: CAMERA, camera: { ...this.camera } }, "*");
     if (!this.resting) this.atRest = new Promise(resolve => { this.resting = resolve; });
     this.wake();
+  }
+
+  // Keeps the eye within reach of the nearest photo's, looking at its target, unless switched off: elsewhere nothing was seen.
+  stay() {
+    const { camera } = this, { eye, target } = camera, from = place => Math.hypot(...add(eye, place, -1));
+    if (!$("stay")?.checked || !this.photos.length) return;
+    const near = this.photos.reduce((best, photo) => from(photo.eye) < from(best.eye) ? photo : best).eye;
+    if (from(near) <= about.photos.reach) return;
+    camera.eye = add(near, add(eye, near, -1), about.photos.reach / from(near));
+    const ahead = unitLength(add(target, camera.eye, -1)), right = unitLength(cross(ahead, this.up));
+    Object.assign(camera, { ahead, right, down: cross(ahead, right) });
   }
 
   wake() { this.frame ??= requestAnimationFrame(now => { this.frame = null; this.tick(now); }); }
@@ -57,6 +69,7 @@ class Page {
     if (this.dirty) {
       this.dirty = false;
       renderer.draw(this.camera, milliseconds, share);
+      this.canvas.style.background = "none";
       this.drawPhotos();
       this.canvas.dataset.drawn = "coarse";
     } else if (now - this.moved > REST && !renderer.refine(camera, share)) {
@@ -185,6 +198,7 @@ class Page {
     if (!this.photos.length) return;
     about.photos.names.forEach((name, i) => $("photo").append(new Option(name, i)));
     $("photo").addEventListener("change", event => { if (event.target.value) this.flyTo(this.photos[event.target.value]); });
+    $("stay")?.addEventListener("change", () => this.changed());
     $("frusta").addEventListener("change", () => this.changed("look"));
     this.marks = this.photos.map((photo, i) => {
       const mark = document.createElementNS("http://www.w3.org/2000/svg", "path"), title = document.createElementNS(mark.namespaceURI, "title");
@@ -235,6 +249,11 @@ class Page {
 
 async function open() {
   document.body.classList.toggle("framed", window.parent !== window);
+  if (about.poster) {                       // shown while a large shader compiles
+    Object.assign($("view").style, { background: `center / contain no-repeat url(${about.poster})` });
+    $("view").dataset.drawn = "poster";
+    await new Promise(done => requestAnimationFrame(() => setTimeout(done)));
+  }
   const compact = await Compact.read(fromBase64($("compact").textContent));
   const renderer = new Renderer($("view"), compact, about, $("march").textContent), page = new Page(renderer);
   $("view").addEventListener("webglcontextlost", event => { event.preventDefault(); $("view").dataset.drawn = "lost"; });

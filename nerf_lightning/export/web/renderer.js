@@ -17,7 +17,7 @@ class Renderer {
 
   // GPU resources, lost with the context.
   prepare() {
-    const { gl, about } = this, field = (about.kind === "planes" ? planesOf : voxelsOf)(gl, this.compact, about);
+    const { gl, about } = this, field = ({ planes: planesOf, hashes: hashesOf }[about.kind] ?? voxelsOf)(gl, this.compact, about);
     const { bounds, sampler } = about, vec3 = row => `vec3(${row.map(number)})`;
     const constants = {
       TERMS: about.terms, ACTIVATION: about.activation, UNIT: number(bounds.unit), LOW: vec3(bounds.low), SIZE: vec3(bounds.size),

@@ -4,6 +4,7 @@ const BRICK = 7;                            // cells along a brick's side, one l
 
 function makeTexture(gl, target, type, [width, height, depth], data, linear) {
   const [inside, format, numbers] = {
+    pairs: [gl.RG8, gl.RG, gl.UNSIGNED_BYTE], halfPairs: [gl.RG16F, gl.RG, gl.HALF_FLOAT],
     bytes: [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE], halves: [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT],
     whole: [gl.R8UI, gl.RED_INTEGER, gl.UNSIGNED_BYTE], places: [gl.RGBA8UI, gl.RGBA_INTEGER, gl.UNSIGNED_BYTE],
   }[type];
@@ -58,26 +59,66 @@ function volumeOf(gl, compact, name) {
   return { side, groups: planes.groups, planes: planes.texture, lines: lines.texture, ranges };
 }
 
-// The color network's weights in the order in which march.glsl reads them.
-function networkOf(compact, groups, terms) {
-  const [first, bias, second, last] = ["0.weight", "0.bias", "1.weight", "1.bias"].map(part => compact.floats("field.color_net." + part));
-  const width = bias.length, inputs = first.length / width, channels = (inputs - terms) / 3, row = [];
-  const four = of => { for (let i = 0; i < 4; i++) row.push(of(i)); };
-  for (let j = 0; j < width; j += 4) {
-    const weight = (i, column) => j + i < width ? first[(j + i) * inputs + column] : 0;
+// A linear layer as march.glsl reads it: for each four outputs their bias, the weights of each input column (-1: none), and, if
+// three outputs follow, the weights of these. The last three outputs end in their own bias.
+function layerOf(compact, name, columns, last) {
+  const [weights, bias] = ["weight", "bias"].map(part => compact.floats(`field.${name}.${part}`)), inputs = weights.length / bias.length;
+  const row = [], after = last ? compact.floats(`field.${last}.weight`) : [], four = of => { for (let i = 0; i < 4; i++) row.push(of(i)); };
+  for (let j = 0; j < bias.length; j += 4) {
     four(i => bias[j + i] ?? 0);
-    for (let term = 0; term < terms; term++) four(i => weight(i, 3 * channels + term));
-    for (let mode = 0; mode < 3; mode++) for (let c = 0; c < 4 * groups; c++) four(i => c < channels ? weight(i, mode * channels + c) : 0);
-    for (let color = 0; color < 3; color++) four(i => j + i < width ? second[color * width + j + i] : 0);
+    for (const column of columns) four(i => column >= 0 && j + i < bias.length ? weights[(j + i) * inputs + column] : 0);
+    for (let at = j; at < after.length; at += bias.length) four(i => j + i < bias.length ? after[at + i] : 0);
   }
-  row.push(...last, 0);
-  const vectors = Array.from({ length: row.length / 4 }, (_, i) => `vec4(${row.slice(4 * i, 4 * i + 4).map(number)})`);
-  return { text: `vec4[](${vectors})`, neurons: Math.ceil(width / 4) };
+  return last ? [...row, ...compact.floats(`field.${last}.bias`), 0] : row;
+}
+
+const inFours = (count, start = 0) => Array.from({ length: 4 * Math.ceil(count / 4) }, (_, i) => i < count ? start + i : -1);
+const vectorsOf = row => `vec4[](${Array.from({ length: row.length / 4 }, (_, i) => `vec4(${row.slice(4 * i, 4 * i + 4).map(number)})`)})`;
+
+// The color network of planes.
+function networkOf(compact, terms) {
+  const width = compact.shape("field.color_net.0.bias")[0], channels = (compact.shape("field.color_net.0.weight")[1] - terms) / 3;
+  const columns = [0, 1, 2].flatMap(mode => inFours(channels, mode * channels));
+  for (let term = terms - 1; term >= 0; term--) columns.unshift(3 * channels + term);
+  return { text: vectorsOf(layerOf(compact, "color_net.0", columns, "color_net.1")), neurons: Math.ceil(width / 4) };
+}
+
+// A hash grid with two features a level (kernels/hashgrid.py), and its networks one after another.
+const TABLE_WIDTH = 2048;
+function hashesOf(gl, compact, about) {
+  const { data, low, span } = compact.stored("field.grid.tables"), height = Math.ceil(data.length / 2 / TABLE_WIDTH);
+  const texels = new data.constructor(2 * TABLE_WIDTH * height), encode = [];
+  texels.set(data);
+  let first = 0;
+  for (const [side, size] of about.levels) {
+    const dense = (side + 1) ** 3 <= size, factors = dense ? [1, side + 1, (side + 1) ** 2] : [1, 2654435761, 805459861];
+    encode.push(`level(unit, ${number(side)}, uvec3(${factors.map(x => x + "u")}), ${dense ? 0 : size - 1}u, ${first}u)`);
+    first += size;
+  }
+  if (encode.length % 2) encode.push("vec2(0)");
+  const width = compact.shape("field.density_net.0.bias")[0], outputs = compact.shape("field.density_net.1.bias")[0], inputs = encode.length / 2;
+  const terms = Array.from({ length: about.terms }, (_, term) => outputs - 1 + term);
+  const layers = [
+    layerOf(compact, "density_net.0", inFours(2 * about.levels.length)), layerOf(compact, "density_net.1", inFours(width)),
+    layerOf(compact, "color_net.0", [...terms, -1, ...inFours(outputs).slice(0, outputs - 1), ...inFours(outputs).slice(outputs)]),
+    layerOf(compact, "color_net.1", inFours(width), "color_net.2"),
+  ];
+  const starts = layers.map((_, i) => layers.slice(0, i).reduce((sum, layer) => sum + layer.length / 4, 0));
+  return {
+    constants: {
+      HASHES: 1, TABLE_WIDTH: TABLE_WIDTH + "u", INPUTS: inputs, OUTPUTS: Math.ceil(outputs / 4), NEURONS: Math.ceil(width / 4), SECOND: starts[1], THIRD: starts[2],
+      FOURTH: starts[3], RESIDUAL: number(about.residual), NETWORK: vectorsOf(layers.flat()),
+      ENCODE: Array.from({ length: inputs }, (_, i) => `encoded[${i}] = vec4(${encode[2 * i]}, ${encode[2 * i + 1]});`).join(" "),
+      ...each("INPUT", inputs), ...each("OUTPUT", Math.ceil(outputs / 4)), ...each("TERM", about.terms), ...each("NEURON", Math.ceil(width / 4)), ...each("HIDDEN", Math.ceil(width / 4)),
+    },
+    textures: { tables: makeTexture(gl, gl.TEXTURE_2D, data instanceof Uint8Array ? "pairs" : "halfPairs", [TABLE_WIDTH, height], texels, false) },
+    ranges: { tableRange: [...low, ...span] },
+  };
 }
 
 function planesOf(gl, compact, about) {
   const density = volumeOf(gl, compact, "density_volume"), color = volumeOf(gl, compact, "color_volume");
-  const { text, neurons } = networkOf(compact, color.groups, about.terms);
+  const { text, neurons } = networkOf(compact, about.terms);
   const textures = { densityPlanes: density.planes, densityLines: density.lines, colorPlanes: color.planes, colorLines: color.lines };
   return {
     constants: {
