@@ -111,7 +111,9 @@ class VolumeRenderer(torch.nn.Module):
         """Renders rays over `backgrounds`, by default the renderer's background."""
         if backgrounds is None:
             backgrounds = self.background.sample(len(rays))
-        if self.unbounded and isinstance(field, HashGridField) and field.view_residual and not torch.is_grad_enabled():
+        # Proposals put samples of even weight close together; others are merged by weight already.
+        is_dense = self.unbounded and samples.optical_depth is None and not torch.is_grad_enabled()
+        if is_dense and isinstance(field, HashGridField) and field.view_residual:
             density, rgb, view_residual = shade_groups(field, rays, samples)
         else:
             density, rgb, view_residual = FieldOutput(*field(samples.positions(rays), samples.directions(rays)))
