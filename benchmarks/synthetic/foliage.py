@@ -29,18 +29,18 @@ def make_foliage(seed: int = 0) -> Solids:
     for _ in range(BOARDS):
         size = rng.uniform(0.15, 0.9, 2)
         center = np.array([rng.uniform(-6, 6), rng.uniform(wall, wall + 2.5), rng.uniform(-2.4, 4)])
-        half_size = size[0], 0.08, size[1]
-        parts.append((bool(rng.random() < 0.3), center, half_size, axes, str(rng.choice(PATTERNS)), False))
+        board = size[0], 0.08, size[1]
+        parts.append((bool(rng.random() < 0.3), center, board, axes, str(rng.choice(PATTERNS)), False))
     for _ in range(FRONDS):
         parts += make_frond(rng)
-    cylinder, center, half_size, axes, patterns, leaf = map(np.array, zip(*parts, strict=True))
+    cylinder, centers, half_size, frames, patterns, leaf = map(np.array, zip(*parts, strict=True))
     count, greens = len(parts), ((0.05, 0.35), (0.25, 0.6), (0.03, 0.15))
     green = np.stack([rng.uniform(low, high, count) for low, high in greens], axis=1)
     color = np.where(leaf[:, None], green, rng.uniform(0.1, 0.8, (count, 3)))
     accent, period = color * rng.uniform(0.3, 0.8, (count, 1)), rng.uniform(0.12, 0.5, count)
     pattern, gloss = np.array([PATTERNS.index(name) for name in patterns]), np.where(leaf, 0.25, 0.05)
-    color, accent, period, gloss = (value.astype(np.float32) for value in (color, accent, period, gloss))
-    return Solids(cylinder, center, half_size, axes, color, accent, pattern, period, gloss)
+    colors = color.astype(np.float32), accent.astype(np.float32), pattern, period.astype(np.float32)
+    return Solids(cylinder, centers, half_size, frames, *colors, gloss.astype(np.float32))
 
 
 def make_frond(rng: np.random.Generator) -> list[Part]:
