@@ -136,7 +136,6 @@ class VoxelField(Field):
             self.mark_read(rows)
         return FieldOutput(self.density_from_raw(raw), torch.sigmoid(rgb))
 
-    @torch.compiler.disable  # each step would recompile
     def mark_read(self, rows: Int[Tensor, "N 8"]) -> None:
         """Records the rows read by a training step."""
         self.steps += 1

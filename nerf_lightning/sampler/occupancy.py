@@ -1,6 +1,7 @@
 """Empty-space skipping: ray marching through the occupied cells of a coarse grid (Instant-NGP, appendix C)."""
 
 import math
+from collections.abc import Hashable
 from typing import Annotated, Any
 
 import torch
@@ -33,6 +34,7 @@ class SampleCapacity:
     """
 
     HEADROOM = 1.25  # relative to the last count
+    MULTIPLE = 64  # of sizes: kernels are compiled for the alignment of their tensors
 
     def __init__(self) -> None:
         self.per_ray: dict[bool, tuple[float, float]] = {}
@@ -44,7 +46,8 @@ class SampleCapacity:
         """Capacities for marched and for kept steps; None to count exactly."""
         if is_full_pass not in self.per_ray:
             return None, None
-        steps, kept = (math.ceil(self.HEADROOM * count * num_rays) for count in self.per_ray[is_full_pass])
+        counts = (self.HEADROOM * count * num_rays / self.MULTIPLE for count in self.per_ray[is_full_pass])
+        steps, kept = (self.MULTIPLE * math.ceil(count) for count in counts)
         return steps, kept
 
     def record_counts(
@@ -128,6 +131,15 @@ class OccupancySampler(Sampler):
     def samples_per_ray(self) -> float | None:
         counts = self.capacity.per_ray.get(False)
         return None if counts is None else counts[1]
+
+    @property
+    def graph_key(self) -> Hashable:
+        if self.full_pass or False not in self.capacity.per_ray or self.min_depth is None:
+            return None
+        return self.updates, self.grid.active.data_ptr(), self.min_depth.data_ptr()
+
+    def read_counts(self) -> None:
+        self.capacity.read_counts()
 
     @property
     def samples(self) -> int:
@@ -223,7 +235,7 @@ class OccupancySampler(Sampler):
         self.full_pass = not phase
         if phase:
             return
-        self.capacity.read_counts()
+        self.read_counts()
 
         def optical_depth(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
             return self._query(density, positions) * self.step_size(self.samples)

@@ -1,7 +1,7 @@
 """Samples (packed intervals along rays) and the base class of samplers."""
 
 import bisect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -146,6 +146,14 @@ class Sampler(BoundedModule):
     def samples_per_ray(self) -> float | None:
         """Samples per ray at the last count, if training steps have buffers of fixed size; None: `Samples` holds them all."""
         return None
+
+    @property
+    def graph_key(self) -> Hashable:
+        """Identifies steps that do the same on the device but for rays and random numbers; None for one with its own sizes."""
+        return ()
+
+    def read_counts(self) -> None:
+        """Hook that reads sample counts from the device: a host-device sync."""
 
     def param_groups(self) -> list[dict[str, Any]]:
         """Named parameter groups of the optimizer for the sampler's parameters."""

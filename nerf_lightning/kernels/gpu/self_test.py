@@ -2,7 +2,7 @@
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import torch
@@ -49,17 +49,24 @@ def find_obstacle(device: torch.device) -> str:
 
 def find_failure(device: torch.device) -> str:
     """Name of a kernel that fails or differs from the reference, and how; "" if there is none."""
+    for name, difference in measure_differences(device):
+        if isinstance(difference, str):
+            return f"{name}: {difference}"
+        if not difference <= TOLERANCE:
+            return f"{name} differs from the reference by {difference:.1e}"
+    return ""
+
+
+def measure_differences(device: torch.device) -> Iterator[tuple[str, float | str]]:
+    """Yields each kernel's name and its largest difference from the reference, or its error."""
     for name, (fast, reference, inputs, num_free) in make_checks(device).items():
         try:
             actual = compute_with_gradients(fast, inputs, num_free)
         except Exception as error:
             log.debug("self-test of %s", name, exc_info=True)
-            return f"{name}: {type(error).__name__}: {' '.join(str(error).split())}"
-        expected = compute_with_gradients(reference, inputs, num_free)
-        difference = max(map(relative_difference, actual, expected))
-        if not difference <= TOLERANCE:
-            return f"{name} differs from the reference by {difference:.1e}"
-    return ""
+            yield name, f"{type(error).__name__}: {' '.join(str(error).split())}"
+            continue
+        yield name, max(map(relative_difference, actual, compute_with_gradients(reference, inputs, num_free)))
 
 
 Check = tuple[Callable[..., Any], Callable[..., Any], list[Tensor], int]
