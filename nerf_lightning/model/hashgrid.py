@@ -116,6 +116,7 @@ class HashGridField(Field):
     GEOMETRY_FEATURES = 15  # passed from the density to the color network, Instant-NGP section 5.4
     INIT_LOG_DENSITY = -1.0  # an exponential density starts as thin fog
     max_lr = 0.1
+    cpu_chunks = 4  # loads each level's table into the core's cache less often
 
     def __init__(
         self,
@@ -159,14 +160,29 @@ class HashGridField(Field):
     def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
         self.grid.prune(visible_cells)
 
-    def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        encoded = self.grid(self.bounds.to_unit(positions))
-        raw, geometry = mlp_heads(encoded, layer_parameters(self.density_net), 1)
-        return self.activation(raw.squeeze(1)), geometry
+    def features(
+        self, positions: Float[Tensor, "N 3"], unit_length: float = 1.0
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+        """See `Field.features`; the density is divided by `unit_length`."""
+        encoded, layers = self.grid(self.bounds.to_unit(positions)), layer_parameters(self.density_net)
+        density, geometry = mlp_heads(encoded, layers, 1, None, self.activation, unit_length)
+        return density.squeeze(1), geometry
+
+    def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        return self.features(positions, self.unit_length)[0]
+
+    def view_logits(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """View-dependent part of the color logits, see `FieldOutput`; only with `view_residual`."""
+        return mlp(features, layer_parameters(self.color_net), encode_directions(directions, self.terms))
+
+    def shade(self, features: Float[Tensor, "N F"], view_logits: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
+        """Features and their `view_logits` -> rgb in [0, 1]."""
+        return torch.sigmoid(features[:, :3] + view_logits)
 
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
-        density, features = self.features(positions)
-        logits = mlp(features, layer_parameters(self.color_net), encode_directions(directions, self.terms))
+        density, features = self.features(positions, self.unit_length)
         if not self.view_residual:
-            return FieldOutput(density / self.unit_length, torch.sigmoid(logits))
-        return FieldOutput(density / self.unit_length, torch.sigmoid(features[:, :3] + logits), logits)
+            layers, basis = layer_parameters(self.color_net), encode_directions(directions, self.terms)
+            return FieldOutput(density, mlp(features, layers, basis, torch.sigmoid))
+        logits = self.view_logits(features, directions)
+        return FieldOutput(density, self.shade(features, logits), logits)

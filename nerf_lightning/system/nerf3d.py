@@ -12,6 +12,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.dataset.ray_datamodule import STEPS_PER_DRAW
+from nerf_lightning.kernels import mean_squared_error, photometric_loss
 from nerf_lightning.kernels.backend import get_kernels
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
@@ -154,17 +155,16 @@ class NeRF3D(System):
             samples = self.sampler(rays.detach(), self.field.density, generator)
         backgrounds = self.renderer.background.sample(len(rays), generator)
         output = self.renderer(rays, samples, self.field, backgrounds)
-        truth, rgb = composite_over(batch.pixels, backgrounds), output.rgb
-        if self.corrections is not None:
+        weights = batch.weights, samples.complete
+        if self.corrections is None:
+            pixels = backgrounds, batch.pixels
+            loss, squared_errors = photometric_loss(output.foreground, output.opacity, *pixels, *weights)
+        else:
             assert batch.views is not None
-            rgb = self.corrections.color(rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
-        if samples.complete is not None:  # truncated rays must not contribute
-            rgb = torch.where(samples.complete[:, None], rgb, truth)
-        squared_errors = (rgb - truth).square().mean(1)
-        losses = {
-            "photometric": (squared_errors if batch.weights is None else squared_errors * batch.weights).mean(),
-            **self.regularize(output, samples, batch),
-        }
+            truth = composite_over(batch.pixels, backgrounds)
+            rgb = self.corrections.color(output.rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
+            loss, squared_errors = mean_squared_error(rgb, truth, *weights)
+        losses = {"photometric": loss, **self.regularize(output, samples, batch)}
         per_ray = self.sampler.samples_per_ray
         stats = StepStats(
             losses["photometric"].detach(),
@@ -235,6 +235,7 @@ class NeRF3D(System):
         """
         color = self.renderer.background.color if background is None else torch.tensor(background, device=self.device)
         outputs, start, num_rays, max_samples = [], 0, self.chunk_rays, SAMPLE_CHUNKS_PER_PASS * self.chunk
+        chunk_samples = self.chunk * (self.field.cpu_chunks if self.device.type == "cpu" else 1)
         while start < len(rays):
             chunk = rays[start : start + num_rays]
             samples = self.sampler(chunk, self.field.density)
@@ -243,10 +244,11 @@ class NeRF3D(System):
             start += len(chunk)
             if near > 0 or far < math.inf:
                 samples = samples.clip(near, far)
-            for span, part in split_by_rays(samples.merge_low_weight_samples(), self.chunk):
+            for span, part in split_by_rays(samples.merge_low_weight_samples(), chunk_samples):
                 outputs.append(self.renderer(chunk[span], part, self.field, color.expand(len(chunk[span]), 3)))
-        names = ("rgb", "opacity", "distance")
-        return RenderOutput(*(torch.cat([getattr(output, name) for output in outputs]) for name in names))
+        names = ("foreground", "opacity", "distance")
+        foreground, opacity, distance = (torch.cat([getattr(output, name) for output in outputs]) for name in names)
+        return RenderOutput(foreground, opacity, distance, color.expand(len(rays), 3))
 
     @property
     def background(self) -> list[float]:

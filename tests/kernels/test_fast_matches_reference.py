@@ -68,10 +68,23 @@ def filter_visible(draw: DRAW) -> Case:
     least, max_dropped = draw(st.sampled_from([(0.0, math.inf), (0.1, math.inf), (0.1, 0.2)]))
 
     def call() -> list[Tensor]:
-        kept, which = k.filter_visible(optical_depth, given, 1e-3, least, max_dropped=max_dropped)
+        kept, which, _ = k.filter_visible(optical_depth, given, 1e-3, least, max_dropped=max_dropped)
         return [kept, *which]
 
     return Case(call, [], rtol=0, atol=0)
+
+
+def average_neighbors(draw: DRAW) -> Case:
+    t, dt, ray, offsets = packed(draw(COUNTS))
+    features, size = torch.randn(5, len(t)).T, draw(st.integers(1, 5))
+    return Case(lambda: list(k.average_neighbors(3 * torch.sin(7 * t) ** 2, features, ray, offsets, size)), [])
+
+
+def median_depth(draw: DRAW) -> Case:
+    given = packed(draw(COUNTS))
+    density = 5 * torch.sin(7 * given[0]) ** 2
+    opacity = k.composite(density, torch.zeros(len(density), 3), *given)[1]
+    return Case(lambda: k.median_depth(density, opacity, given), [], atol=1e-5)
 
 
 def merge_low_weight(draw: DRAW) -> Case:
@@ -167,8 +180,7 @@ def march(draw: DRAW) -> Case:
     occupied = torch.rand(draw(st.sampled_from([1, 6, 24])) ** 3) < draw(st.sampled_from([0.0, 0.03, 0.5, 1.0]))
     samples, step = draw(st.sampled_from([1, 30, 100])), draw(st.sampled_from([1e-3, 0.05, 10.0]))
     shift = torch.rand(71) if draw(st.booleans()) else torch.zeros(71)
-    ends = bounds.near_far(rays)
-    return Case(lambda: k.march(rays, bounds, *ends, shift, occupied, samples, unit * step), [], rtol=0, atol=0)
+    return Case(lambda: k.march(rays, bounds, shift, occupied, samples, unit * step), [], rtol=0, atol=0)
 
 
 def proposals(draw: DRAW) -> Case:
@@ -183,7 +195,9 @@ def proposals(draw: DRAW) -> Case:
 LEARNING = [composite, spherical_harmonics, hash_interpolate, mlp, planes, ray_positions, voxels]
 
 
-@pytest.mark.parametrize("kernel", [*LEARNING, filter_visible, merge_low_weight, march, proposals])
+@pytest.mark.parametrize(
+    "kernel", [*LEARNING, filter_visible, merge_low_weight, average_neighbors, median_depth, march, proposals]
+)
 @given(data=st.data(), seed=st.integers(0, 1000))
 def test_fast_kernel_any_input_matches_reference(kernel: Callable[[DRAW], Case], data: st.DataObject, seed: int):
     torch.manual_seed(seed)
