@@ -50,8 +50,7 @@ class Bounds(TensorDataclass):
 
     def __post_init__(self) -> None:
         with torch.inference_mode(False):  # they enter autograd even if created in inference mode
-            box = self.aabb if self.core is None else self.core
-            center, half_size = box.mean(0), (box[1] - box[0]) / 2
+            center, half_size = self.box.mean(0), (self.box[1] - self.box[0]) / 2
             derived = {"center": center, "half_size": half_size, "max_half_size": float(half_size.max())}
             low, size = center - half_size, 2 * half_size
             derived |= {"_low": low, "_size": size, "_scale": 1 / size, "_offset": -low / size}
@@ -66,6 +65,11 @@ class Bounds(TensorDataclass):
         norm = max(1.0, float(((self.content_center - self.center) / self.half_size).abs().max()))
         # The contraction maps the core to the middle half of the unit cube, and shrinks what is at `norm` half-sizes.
         return (4 if self.unbounded else 2) * self.max_half_size / self.pixel_footprint * (norm / (2 - 1 / norm))
+
+    @property
+    def box(self) -> Float[Tensor, "2 3"]:
+        """What is not contracted: `core`, or else `aabb`."""
+        return self.aabb if self.core is None else self.core
 
     @property
     def content_center(self) -> Float[Tensor, "3"]:
@@ -119,8 +123,7 @@ class Bounds(TensorDataclass):
         """Entry and exit distance of each ray's line, by the slab test; exit < entry if it misses."""
         # A zero component never crosses its slab: clamped, the division gives +-huge instead of NaN.
         safe = rays.directions.masked_fill(rays.directions.abs() < 1e-9, 1e-9)
-        box = self.aabb if self.core is None else self.core
-        crossings = (box[:, None] - rays.origins) / safe
+        crossings = (self.box[:, None] - rays.origins) / safe
         return crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)
 
     def content_interval(self, rays: Rays) -> Float[Tensor, "R 2"]:

@@ -74,7 +74,7 @@ def describe_field(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
         "least": MIN_WEIGHT,
         "background": system.renderer.background.color.tolist(),
         "bounds": {
-            "low": (bounds.aabb if bounds.core is None else bounds.core)[0].tolist(),
+            "low": bounds.box[0].tolist(),
             "size": (2 * bounds.half_size).tolist(),
             "unit": bounds.max_half_size,
             "unbounded": bounds.unbounded,
