@@ -9,6 +9,7 @@ from torch import Tensor
 
 import nerf_lightning as nl
 from benchmarks.methods import train
+from benchmarks.synthetic.foliage import write_foliage
 from benchmarks.synthetic.rooms import render_true_view, write_room
 from benchmarks.tables import Rows, compute_medians
 from nerf_lightning.cameras import Rays
@@ -64,6 +65,7 @@ def measure(args: argparse.Namespace) -> Rows:
         if not folder.exists():
             write_room(synthetic_room, folder)
         folders[name] = folder, synthetic_room
+    folders["foliage"] = write_foliage(output / "foliage"), None
     rows: Rows = []
     for name, (path, room) in folders.items():
         for recipe in args.recipes or RECIPES:

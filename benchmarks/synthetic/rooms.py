@@ -4,11 +4,12 @@ import json
 from pathlib import Path
 
 import imageio.v3 as imageio
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
-from nerf_lightning.cameras import Rays
+from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import Scene
 from nerf_lightning.synthetic.objects import trace_rays
 from nerf_lightning.synthetic.rooms import Room, make_handheld_cameras, render_room
@@ -17,18 +18,23 @@ WIDTH, HEIGHT, VIEWS = 240, 180, 56
 
 
 def write_room(room: Room, folder: Path, seed: int = 0) -> None:
+    """Writes a room as a capture."""
+    cameras = make_handheld_cameras(VIEWS, WIDTH, HEIGHT, seed)
+    write_capture(cameras, render_room(room, cameras).images.numpy(), folder)
+
+
+def write_capture(cameras: Cameras, photos: UInt8[np.ndarray, "V H W 3"], folder: Path) -> None:
     """Writes photos and a transforms.json."""
     (folder / "images").mkdir(parents=True)
-    cameras, frames = make_handheld_cameras(VIEWS, WIDTH, HEIGHT, seed), []
-    photos = render_room(room, cameras).images.numpy()
-    for view in range(VIEWS):
+    frames = []
+    for view, photo in enumerate(photos):
         name = f"images/{view:03d}.png"
-        imageio.imwrite(folder / name, photos[view])
+        imageio.imwrite(folder / name, photo)
         pose = cameras.c2w[view] * torch.tensor([1.0, -1.0, -1.0, 1.0])  # OpenGL: y up, looking along -z
         frames.append({"file_path": name, "transform_matrix": pose.tolist()})
-    K = cameras.K[0]
+    K, (height, width) = cameras.K[0], photos.shape[1:3]
     lens = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1]), "cx": float(K[0, 2]), "cy": float(K[1, 2])}
-    (folder / "transforms.json").write_text(json.dumps({**lens, "w": WIDTH, "h": HEIGHT, "frames": frames}))
+    (folder / "transforms.json").write_text(json.dumps({**lens, "w": width, "h": height, "frames": frames}))
 
 
 def render_true_view(room: Room, scene: Scene, view: int) -> tuple[Float[Tensor, "R"], Int[Tensor, "R"]]:

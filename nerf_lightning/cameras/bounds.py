@@ -23,8 +23,8 @@ MAX_RESOLUTION_SCALE = 2.0
 class Bounds(TensorDataclass):
     """An axis-aligned box around the content, in world units.
 
-    A bounded scene has no content outside the box. An unbounded one keeps full resolution inside the box and contracts
-    the outside into a shell of the unit cube (mip-NeRF 360, eq. 10, with the max norm).
+    A bounded scene has no content outside the box. An unbounded one keeps full resolution inside the box, or inside its
+    `core`, and contracts the outside into a shell of the unit cube (mip-NeRF 360, eq. 10, with the max norm).
     """
 
     aabb: Float[Tensor, "2 3"]
@@ -35,8 +35,12 @@ class Bounds(TensorDataclass):
     far: float | None = None
     pixel_footprint: float | None = None
     """Footprint of a photo's pixel at the content, world units; None if unknown."""
+    core: Float[Tensor, "2 3"] | None = None
+    """Cube around the cameras of an unbounded scene, up to the nearest content, where all look one way: grids and samples
+    are then spaced in perspective and disparity, like the photos, as in normalized device coordinates (NeRF, appendix C)."""
 
     center: Float[Tensor, "3"] = field(init=False, repr=False)
+    """Center of `core`, or else of the box, and its half-size."""
     half_size: Float[Tensor, "3"] = field(init=False, repr=False)
     max_half_size: float = field(init=False, repr=False)
     _low: Float[Tensor, "3"] = field(init=False, repr=False)
@@ -46,7 +50,7 @@ class Bounds(TensorDataclass):
 
     def __post_init__(self) -> None:
         with torch.inference_mode(False):  # they enter autograd even if created in inference mode
-            center, half_size = self.aabb.mean(0), (self.aabb[1] - self.aabb[0]) / 2
+            center, half_size = self.box.mean(0), (self.box[1] - self.box[0]) / 2
             derived = {"center": center, "half_size": half_size, "max_half_size": float(half_size.max())}
             low, size = center - half_size, 2 * half_size
             derived |= {"_low": low, "_size": size, "_scale": 1 / size, "_offset": -low / size}
@@ -58,8 +62,19 @@ class Bounds(TensorDataclass):
         """Photo pixels along the unit cube's longest edge, at their footprint in the box."""
         if self.pixel_footprint is None:
             return math.inf
-        # The contraction maps the box to the middle half of the unit cube.
-        return (4 if self.unbounded else 2) * self.max_half_size / self.pixel_footprint
+        norm = max(1.0, float(((self.content_center - self.center) / self.half_size).abs().max()))
+        # The contraction maps the core to the middle half of the unit cube, and shrinks what is at `norm` half-sizes.
+        return (4 if self.unbounded else 2) * self.max_half_size / self.pixel_footprint * (norm / (2 - 1 / norm))
+
+    @property
+    def box(self) -> Float[Tensor, "2 3"]:
+        """What is not contracted: `core`, or else `aabb`."""
+        return self.aabb if self.core is None else self.core
+
+    @property
+    def content_center(self) -> Float[Tensor, "3"]:
+        """Center of the box of the content."""
+        return self.aabb.mean(0)
 
     @property
     def resolution_scale(self) -> float:
@@ -108,7 +123,7 @@ class Bounds(TensorDataclass):
         """Entry and exit distance of each ray's line, by the slab test; exit < entry if it misses."""
         # A zero component never crosses its slab: clamped, the division gives +-huge instead of NaN.
         safe = rays.directions.masked_fill(rays.directions.abs() < 1e-9, 1e-9)
-        crossings = (self.aabb[:, None] - rays.origins) / safe
+        crossings = (self.box[:, None] - rays.origins) / safe
         return crossings.amin(0).amax(-1), crossings.amax(0).amin(-1)
 
     def content_interval(self, rays: Rays) -> Float[Tensor, "R 2"]:
@@ -120,7 +135,7 @@ class Bounds(TensorDataclass):
     def s_to_t(
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "*#R S"]
     ) -> Float[Tensor, "R S"]:
-        """Maps s in [0, 1] to distances: linear if bounded; if not, linear inside the box, sparser outside.
+        """Maps s in [0, 1] to distances: linear if bounded; if not, linear inside the box (or its core), sparser outside.
 
         The unbounded map is uniform in `warp`, as mip-NeRF 360's samples are in contracted space (section 3): outside the
         box, step size grows with the square of 1 + the distance to the box in half-sizes.

@@ -225,7 +225,7 @@ def get_metadata(data: DataModule) -> Metadata:
     if isinstance(data, PixelDataModule):
         return ImageMetadata(*data.scene.size)
     bounds, train = data.scene.bounds, data.scene.train
-    pixel_footprint = train.cameras.pixel_footprint(bounds.center)
+    pixel_footprint = train.cameras.pixel_footprint(bounds.content_center)
     photos = train.cameras, train.channels == 4, train.exposures
     return SceneMetadata(replace(bounds, pixel_footprint=pixel_footprint or None), data.scene.background, *photos)
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import (
     Bounds,
+    CameraLayout,
     Cameras,
     estimate_up,
     has_panoramas,
@@ -21,6 +22,7 @@ from nerf_lightning.cameras import (
     transform_points,
     transform_poses,
 )
+from nerf_lightning.cameras.bounds import UNBOUNDED_FAR_HALF_SIZES
 from nerf_lightning.dataset.formats import checks
 from nerf_lightning.dataset.matching.triangulation import triangulate_matches
 from nerf_lightning.dataset.photo_loading import PhotoLoadOptions, PosedPhoto, load_views
@@ -38,6 +40,8 @@ NEAR_FRACTION = 0.25
 """Near plane as a fraction of the nearest camera's distance to the common subject."""
 CONTENT_NEAR_FRACTION = 0.7
 """Near plane as a fraction of the nearest known content's distance; the smaller of the two counts."""
+MAX_CORE_HALF_SIZE = 0.5
+"""Half-size of a core, in distances to the subject, from which perspective spacing gains nothing."""
 MAX_NEAR_POINTS, OUTLIER_QUANTILE = 4096, 0.01
 """Points used for the near plane, and the fraction per view treated as outliers."""
 
@@ -147,8 +151,6 @@ def assemble_scene(
     if hints.background is not None:
         kind = replace(kind, background=hints.background)
     region = locate_region(source, train, hints)
-    text = "%s: %s scene, since %s (dataset.bounded overrides); %s cameras"
-    log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason, region.layout)
     if not region.has_depth and not kind.bounded:
         text = "%s: %s cameras, and neither poses nor points determine the depth; assuming %.3g in the file's unit"
         log.warning(text, source, region.layout, region.unit)
@@ -163,6 +165,10 @@ def assemble_scene(
 
     splits = [replace(apply_alpha(part, kind.is_cutout), cameras=move(part.cameras)) for part in parts]
     center = transform_points(from_source, region.center.double()).float()
+    bounds = find_bounds(splits[0], kind, from_source, hints, region)
+    text = "%s: %s scene, since %s (dataset.bounded overrides); %s cameras%s"
+    spacing = "" if bounds.core is None else ", detail spaced in perspective and disparity"
+    log.info(text, name, "bounded" if kind.bounded else "unbounded", kind.reason, region.layout, spacing)
     path = hints.camera_path
     orbit = make_orbit_path(splits[0].cameras, region.layout, center) if path is None else move(path)
     return Scene(
@@ -172,7 +178,7 @@ def assemble_scene(
         val=splits[1],
         test=splits[2] if splits[2:] else None,
         orbit=orbit,
-        bounds=find_bounds(splits[0], kind, from_source, hints, region),
+        bounds=bounds,
         background=kind.background,
         to_source=to_source if hints.to_source is None else torch.from_numpy(hints.to_source) @ to_source,
         kind=f"{kind.reason}; {region.layout} cameras",
@@ -215,7 +221,18 @@ def find_bounds(
     if region.has_subject:
         nears.append(NEAR_FRACTION * min(1.0, float(views.cameras.centers.norm(dim=1).min())))
     near = min(nears, default=None) if near is None else near
-    return Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]), unbounded=True, near=near, far=far)
+    core = find_core(views.cameras, near or NEAR_FRACTION) if region.layout == CameraLayout.FORWARD else None
+    if core is not None and far is None:
+        far = UNBOUNDED_FAR_HALF_SIZES  # of the box, not of the core
+    return Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]), unbounded=True, near=near, far=far, core=core)
+
+
+def find_core(cameras: Cameras, near: float) -> Float[Tensor, "2 3"] | None:
+    """Finds the core of forward-facing cameras in the region's frame, see `Bounds.core`: a cube around all of them up to the
+    near plane; None if that is as large as half the region's."""
+    low, high = cameras.centers.amin(0), cameras.centers.amax(0)
+    center, half = (low + high) / 2, max(near, float((high - low).max()) / 2)
+    return torch.stack([center - half, center + half]) if half < MAX_CORE_HALF_SIZE else None
 
 
 def list_viewing_poses(cameras: Cameras) -> Float[Tensor, "W 4 4"]:

@@ -143,7 +143,7 @@ def check_bounds(scene: Scene) -> Iterator[SceneIssue]:
     if not bounds.unbounded and (bounds.near, bounds.far) != (None, None):
         yield from check_clipping(scene)
     region = find_region(cameras.c2w)
-    offset, size = float((region.center - bounds.center)[:2].norm()), bounds.max_half_size
+    offset, size = float((region.center - bounds.content_center)[:2].norm()), bounds.max_half_size
     directions = torch.nn.functional.normalize(cameras.centers - region.center.float(), dim=1)
     is_surrounded = region.layout == CameraLayout.INWARD and float(directions[:, :2].mean(0).norm()) < MAX_ASYMMETRY
     if is_surrounded and offset > MAX_BOX_OFFSET * region.unit:

@@ -57,7 +57,7 @@ def find_visible_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
     """Cells of an n^3 grid over the bounds in which any camera sees content; ray spacing matches the cells."""
     bounds = system.field.bounds
     cell = (4 if bounds.unbounded else 2) * bounds.max_half_size / n
-    factor = min(MAX_RAYS_PER_PIXEL_SIDE, math.ceil(cameras.pixel_footprint(bounds.center.cpu()) / cell))
+    factor = min(MAX_RAYS_PER_PIXEL_SIDE, math.ceil(cameras.pixel_footprint(bounds.content_center.cpu()) / cell))
     supersampled = cameras.rescale(factor)
     seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
     for view in track_progress(range(len(supersampled)), len(supersampled), "views"):

@@ -72,7 +72,7 @@ def find_unoccluded_cells(system: NeRF3D, volume: Volume, cameras: Cameras) -> B
     occluded = torch.arange(len(centers))
     cameras = cameras.rescale(min(1.0, MAX_VISIBILITY_SIDE / cameras.max_side))
     # A slanted surface has many depths within a pixel: the tolerance is at least the pixel's width.
-    tolerance = max(volume.cell, CELL_WIDTH_PIXELS * cameras.pixel_footprint(system.field.bounds.center.cpu()))
+    tolerance = max(volume.cell, CELL_WIDTH_PIXELS * cameras.pixel_footprint(system.field.bounds.content_center.cpu()))
     for view in track_progress(range(len(cameras)), len(cameras), "views"):
         rendered = system.render(cameras.generate_view_rays(view).to(system.device))
         depths = torch.where(rendered.opacity > 0.5, rendered.depth, MISS_DISTANCE).cpu() + tolerance

@@ -84,7 +84,7 @@ def describe_field(system: NeRF3D, orbit: Cameras) -> dict[str, Any]:
         "least": MIN_SAMPLE_WEIGHT if hashed else MIN_WEIGHT,
         "background": system.renderer.background.color.tolist(),
         "bounds": {
-            "low": bounds.aabb[0].tolist(),
+            "low": bounds.box[0].tolist(),
             "size": (2 * bounds.half_size).tolist(),
             "unit": bounds.max_half_size,
             "unbounded": bounds.unbounded,

@@ -47,9 +47,9 @@ class PoseRefinement(torch.nn.Module):
         if focal and cameras.lenses is not None and bool((cameras.lenses.projection != Projection.PERSPECTIVE).any()):
             found = "true, with fisheye or equirectangular photos"
             raise InputError("refine.focal", "", found, "false for these")
-        centers, content_center = cameras.centers.cpu().double(), bounds.center.cpu().double()
+        centers, content_center = cameras.centers.cpu().double(), bounds.content_center.cpu().double()
         corners = torch.rand(NUM_POINTS, 3, dtype=torch.float64, generator=step_generator(0, Stream.ANALYSIS, 0))
-        points = content_center + bounds.half_size.cpu().double() * (2 * corners - 1)
+        points = content_center + (bounds.aabb[1] - bounds.aabb[0]).cpu().double() * (corners - 0.5)
         preconditioner = compute_preconditioner(
             compute_projection_jacobian(centers, cameras.K[:, 0, 0].cpu().double(), points), PRECONDITIONER_DAMPING
         )

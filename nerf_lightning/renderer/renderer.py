@@ -75,7 +75,7 @@ class VolumeRenderer(torch.nn.Module):
         distortion_loss_weight: weight of `distortion_loss`, against fog.
         near_loss_weight: initial weight of `near_loss`, against density near the cameras; it fades out.
         view_loss_weight: weight of `view_loss`, on view-dependent color; "auto": `AUTO_VIEW_LOSS_WEIGHT`.
-        half_size: half-size of the scene's box, world units.
+        half_size: half-size of the scene's box or core, world units.
         unbounded: see `Bounds`.
         alpha: whether the photos have alpha.
     """

@@ -43,6 +43,7 @@ def scene_to_dict(data: DataModule) -> dict[str, Any]:
             "background": list(frame.background),
             "aabb": frame.bounds.aabb.tolist(),
             "unbounded": frame.bounds.unbounded,
+            "core": None if frame.bounds.core is None else frame.bounds.core.tolist(),
             "near": frame.bounds.near,
             "far": frame.bounds.far,
             "pixel": frame.bounds.pixel_footprint,
@@ -89,7 +90,9 @@ def parse_metadata(scene: Mapping[str, Any], where: object) -> tuple[Metadata, C
         aabb = torch.from_numpy(checks.check_box(where, "aabb", scene["aabb"])).float()
         red, green, blue = checks.parse_array(where, "background", scene["background"], 3).tolist()
         to_source = checks.check_similarity(where, "to_source", scene["to_source"])
-        frame = SceneMetadata(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel), (red, green, blue))
+        core = scene.get("core")  # absent from older runs
+        core = None if core is None else torch.from_numpy(checks.check_box(where, "core", core)).float()
+        frame = SceneMetadata(Bounds(aabb, bool(scene["unbounded"]), near, far, pixel, core), (red, green, blue))
         return frame, parse_cameras(where, "orbit.", scene["orbit"]), torch.from_numpy(to_source)
     except (LookupError, TypeError) as error:
         raise InputError(where, "", f"damaged ({type(error).__name__}: {error})") from error

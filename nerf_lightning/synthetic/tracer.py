@@ -1,4 +1,4 @@
-"""Ray tracer of the bulldozer: exact color, alpha and depth."""
+"""Ray tracer of solids: exact color, alpha and depth."""
 
 import functools
 from typing import NamedTuple
@@ -45,21 +45,30 @@ class ShadowMap(NamedTuple):
     depth: Float[np.ndarray, "S S"]
 
 
-@functools.cache
-def render_shadow_map() -> ShadowMap:
-    light, radius = np.array(fast.LIGHT_POSITION, float), float(np.linalg.norm(load_bulldozer().aabb, axis=1).max())
+def make_shadow_map(solids: Solids, radius: float) -> ShadowMap:
+    """Makes the shadow map that covers a sphere around the origin, world units."""
+    light = np.array(fast.LIGHT_POSITION, float)
     c2w = look_at(torch.from_numpy(light).float(), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     focal = SHADOW_MAP_SIZE_PX / 2 * float(np.sqrt(light @ light - radius**2)) / radius
     center = SHADOW_MAP_SIZE_PX / 2
     K = torch.tensor([[focal, 0, center], [0, focal, center], [0, 0, 1]])
     cameras = Cameras.pinhole(K[None], c2w[None], SHADOW_MAP_SIZE_PX, SHADOW_MAP_SIZE_PX)
-    return ShadowMap(c2w[:3, :3].numpy(), focal, *rasterize(load_bulldozer(), cameras, 0))
+    return ShadowMap(c2w[:3, :3].numpy(), focal, *rasterize(solids, cameras, 0))
 
 
-def render_view(cameras: Cameras, view: int) -> UInt8[np.ndarray, "H W 4"]:
-    """Renders a view of the bulldozer: sRGB and straight alpha, supersampled."""
-    fine, solids = cameras.rescale(SUPERSAMPLING), load_bulldozer()
+@functools.cache
+def render_shadow_map() -> ShadowMap:
+    """Renders the bulldozer's shadow map."""
+    solids = load_bulldozer()
+    return make_shadow_map(solids, float(np.linalg.norm(solids.aabb, axis=1).max()))
+
+
+def render_view(
+    cameras: Cameras, view: int, solids: Solids | None = None, shadow: ShadowMap | None = None
+) -> UInt8[np.ndarray, "H W 4"]:
+    """Renders a view of solids with their shadow map, by default the bulldozer: sRGB and straight alpha, supersampled."""
+    fine, solids, shadow = cameras.rescale(SUPERSAMPLING), solids or load_bulldozer(), shadow or render_shadow_map()
     rgba = np.zeros((cameras.height, cameras.width, 4), np.uint8)
     K, c2w = fine.K[view].numpy(), fine.c2w[view].numpy()
-    fast.shade(solids.to_float32(), render_shadow_map(), K, c2w, *rasterize(solids, fine, view), rgba)
+    fast.shade(solids.to_float32(), shadow, K, c2w, *rasterize(solids, fine, view), rgba)
     return rgba

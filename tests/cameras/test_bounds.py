@@ -102,3 +102,21 @@ def test_s_to_t_unbounded_steps_grow_outside_the_box():
     torch.testing.assert_close(edges[:, [0, -1]], torch.stack([near, far], dim=1), atol=1e-4, rtol=1e-4)
     growth = steps / (1 + beyond) ** 2
     torch.testing.assert_close(growth, growth.median(dim=1, keepdim=True).values.expand_as(growth), rtol=1e-2, atol=0)
+
+
+def test_core_spaces_cells_in_perspective_and_samples_in_disparity():
+    """With a core around the cameras a cell covers nearly as many pixels near as far, and steps grow with t^2."""
+    box, core = torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), torch.tensor([[-0.25, -1.25, -0.25], [0.25, -0.75, 0.25]])
+    bounds = Bounds(box, unbounded=True, near=0.25, pixel_footprint=0.002, core=core)
+    distance = torch.tensor([0.25, 0.5, 1.0, 4.0])
+    along = torch.stack([0 * distance, distance - 1, 0 * distance], dim=1)
+    aside = along + 0.002 * distance[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    per_pixel = (bounds.to_unit(aside) - bounds.to_unit(along))[:, 0]
+    torch.testing.assert_close(per_pixel, 0.0005 * (2 - 0.25 / distance))
+    assert bounds.unit_cube_pixels == pytest.approx(1 / float(per_pixel[2]), rel=1e-4)
+    assert Bounds(box, unbounded=True, pixel_footprint=0.002).unit_cube_pixels == pytest.approx(2000)
+    rays = Rays(torch.tensor([[0.0, -1, 0]]), torch.tensor([[0.0, 1, 0]]))
+    edges = bounds.s_to_t(rays, *bounds.near_far(rays), torch.linspace(0, 1, 9)[None])
+    torch.testing.assert_close((1 / edges).diff(dim=1), (1 / edges).diff(dim=1).mean().expand(1, 8), rtol=1e-3, atol=0)
+    positions = along + torch.tensor([0.3, 0.1, -0.2])
+    torch.testing.assert_close(bounds.to_world(bounds.to_unit(positions)), positions)

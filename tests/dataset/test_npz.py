@@ -77,7 +77,7 @@ def test_load_npz_splits_follow_the_keys(arrays: Arrays, path: Path):
 
 
 def test_save_npz_then_load_returns_the_same_scene(ball: Scene, path: Path):
-    bounds = replace(ball.bounds, unbounded=True, near=0.5, far=9.0)
+    bounds = replace(ball.bounds, unbounded=True, near=0.5, far=9.0, core=ball.bounds.aabb / 4)
     to_source = torch.tensor([[2.0, 0, 0, 1], [0, 2, 0, 2], [0, 0, 2, 3], [0, 0, 0, 1]])
     scene = replace(ball, bounds=bounds, background=(1.0, 1.0, 1.0), to_source=to_source)
     save_npz(scene, path)
@@ -87,7 +87,7 @@ def test_save_npz_then_load_returns_the_same_scene(ball: Scene, path: Path):
         assert torch.equal(getattr(back, name).cameras.c2w, getattr(scene, name).cameras.c2w)
         assert torch.equal(getattr(back, name).cameras.K, getattr(scene, name).cameras.K)
     assert torch.equal(back.orbit.c2w, scene.orbit.c2w)
-    assert torch.equal(back.bounds.aabb, bounds.aabb)
+    assert torch.equal(back.bounds.aabb, bounds.aabb) and torch.equal(back.bounds.core, bounds.core)
     assert (back.bounds.unbounded, back.bounds.near, back.bounds.far) == (True, 0.5, 9.0)
     assert back.background == (1.0, 1.0, 1.0) and torch.equal(back.to_source, to_source)
 

@@ -7,10 +7,11 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from nerf_lightning.cameras import Cameras, make_circle_poses, transform_poses
-from nerf_lightning.dataset import Views, open_scene
+from nerf_lightning.cameras import Cameras, look_at, make_circle_poses, transform_poses
+from nerf_lightning.dataset import RayDataModule, Views, open_scene
 from nerf_lightning.dataset.region import find_region
 from nerf_lightning.dataset.scene_builder import make_region_frame
+from nerf_lightning.runs.scene_file import parse_metadata, scene_to_dict
 from tests.helpers.exif_tags import encode_exif
 from tests.helpers.scene_writers import write_photos, write_transforms
 
@@ -47,6 +48,26 @@ def test_open_scene_walk_has_no_near(tmp_path: Path):
         names = write_photos(tmp_path / name, views)
         write_transforms(tmp_path / name / "transforms.json", views, names, w=16, h=12)
         assert open_scene(str(tmp_path / name)).bounds.near == (near if near is None else pytest.approx(near))
+
+
+def test_open_scene_forward_cameras_get_a_core(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    """Around all cameras of a grid that look one way; not around a ring."""
+    caplog.set_level("INFO")
+    grid = torch.cartesian_prod(torch.arange(-1.0, 2), torch.arange(-1.0, 2), torch.zeros(1))
+    forward = look_at(grid, torch.tensor([0.0, 0, 12]), torch.tensor([0.0, -1, 0]))
+    for name, c2w, has_core in (("forward", forward, True), ("ring", RING, False)):
+        views = make_noise_views(c2w)
+        names = write_photos(tmp_path / name, views)
+        write_transforms(tmp_path / name / "transforms.json", views, names, w=16, h=12)
+        caplog.clear()
+        scene = open_scene(str(tmp_path / name))
+        core = scene.bounds.core
+        assert (core is not None) == has_core == ("perspective and disparity" in caplog.text)
+        if core is not None:
+            assert ((scene.train.cameras.centers - core.mean(0)).abs() <= scene.bounds.near).all()
+            assert float(core[1, 0] - core[0, 0]) / 2 == pytest.approx(scene.bounds.near)
+            reloaded, _, _ = parse_metadata(scene_to_dict(RayDataModule(scene)), "made")
+            assert torch.equal(reloaded.bounds.core, core)
 
 
 def test_open_scene_exposures_come_from_exif(tmp_path: Path):

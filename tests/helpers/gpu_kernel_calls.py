@@ -120,7 +120,8 @@ def run_network(widths: list[int], num_extra: int, num_head: int, count: int, *a
 
 
 def locate_midpoints(num_rays: int, steps: int) -> Call:
-    bounds = Bounds(torch.tensor([[-1.0, -1.1, -0.9], [1, 1.05, 1]]), unbounded=True)
+    box = torch.tensor([[-1.0, -1.1, -0.9], [1, 1.05, 1]])
+    bounds = Bounds(4 * box, unbounded=True, core=box)
     origins, directions = 2 * torch.randn(num_rays, 3), normalize(torch.randn(num_rays, 3), dim=1)  # some miss the box
     directions[1] = torch.tensor([0.0, 0, 1])
     origins[2, 0] = math.nan

@@ -185,6 +185,8 @@ def march(draw: DRAW) -> Case:
 
 def proposals(draw: DRAW) -> Case:
     bounds, s = replace(UNBOUNDED, near=0.1, unbounded=draw(st.booleans())), torch.rand(50, 13).sort(1).values
+    if bounds.unbounded and draw(st.booleans()):
+        bounds = replace(bounds, core=0.2 * bounds.aabb + 0.5)
     rays = Rays(4 * directions(50), directions(50))
     if draw(st.booleans()):
         return Case(lambda: k.interval_midpoints(rays, bounds, *bounds.near_far(rays), s), [], rtol=0, atol=0)

@@ -28,7 +28,7 @@ log = logging.getLogger(__name__)
 REQUIRED_KEYS = ("images_train", "c2ws_train")
 POSE_KEYS = {"images_train": "c2ws_train", "images_val": "c2ws_val", "images_test": "c2ws_test"}
 """Image key of each split -> its pose key."""
-OPTIONAL_KEYS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "to_source")
+OPTIONAL_KEYS = ("focal", "K", "near", "far", "aabb", "background", "unbounded", "core", "to_source")
 
 
 def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = DEFAULT_OPTIONS) -> Scene:
@@ -40,7 +40,7 @@ def load_npz(path: Path, name: str | None = None, options: PhotoLoadOptions = DE
         c2ws_train, c2ws_val, c2ws_test: (V, 4, 4); the last without images is the orbit, generated if absent.
         focal: pixels, with the principal point in the middle; or K: (3, 3), for all views, which takes precedence.
         near, far: distances along the rays, and aabb: (2, 3), world units, with unbounded: whether content lies outside aabb
-            too; without aabb the photos are classified, see `classify_scene`.
+            too, and core: (2, 3), see `Bounds.core`; without aabb the photos are classified, see `classify_scene`.
         background: (3,), sRGB; defaults to the uniform border color of the photos, or black.
         to_source: (4, 4), similarity to the frame of the source; defaults to the identity.
 
@@ -125,7 +125,10 @@ def read_bounds(path: Path, data: Mapping[str, np.ndarray], options: PhotoLoadOp
     """Reads the box of a file."""
     aabb = torch.from_numpy(checks.check_box(path, "aabb", data["aabb"])).float()
     unbounded = bool(checks.parse_number(path, "unbounded", data.get("unbounded", 0)))
-    return Bounds(aabb, unbounded if options.bounded == "auto" else options.bounded == "false")
+    unbounded = unbounded if options.bounded == "auto" else options.bounded == "false"
+    if not unbounded or "core" not in data:
+        return Bounds(aabb, unbounded)
+    return Bounds(aabb, unbounded, core=torch.from_numpy(checks.check_box(path, "core", data["core"])).float())
 
 
 def save_npz(scene: Scene, path: Path) -> None:
@@ -148,6 +151,7 @@ def save_npz(scene: Scene, path: Path) -> None:
         "K": K,
         "aabb": scene.bounds.aabb,
         "unbounded": scene.bounds.unbounded,
+        "core": scene.bounds.core,
         "to_source": scene.to_source,
         "near": scene.bounds.near,
         "far": scene.bounds.far,

@@ -109,7 +109,7 @@ def march(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`kernels.march` of a bounded scene."""
     count, resolution = len(rays), round(len(occupied) ** (1 / 3))
-    box = bounds.aabb, bounds.center, bounds.half_size
+    box = bounds.box, bounds.center, bounds.half_size
     limits = shift.new_empty(2, count)
     inputs = *(x.contiguous() for x in (rays.origins, rays.directions, shift)), *box, occupied, limits
     ends = float(max(bounds.near or 0.0, 0.0)), math.inf if bounds.far is None else float(bounds.far)

@@ -91,7 +91,7 @@ def interval_midpoints(rays: Rays, bounds: Bounds, near: Tensor, far: Tensor, s:
     rows, steps = len(s), s.shape[1] - 1
     unit, t, dt = s.new_empty(3, rows * steps), s.new_empty(rows, steps), s.new_empty(rows, steps)
     inputs = (x.contiguous() for x in (rays.origins, rays.directions, near, far, s))
-    box = bounds.aabb, bounds.center, bounds.half_size
+    box = bounds.box, bounds.center, bounds.half_size
     grid = (triton.cdiv(t.numel(), BLOCK),)
     locate_midpoints(grid, *inputs, *box, unit, t, dt, t.numel(), steps, bounds.max_half_size, B=BLOCK)
     return unit.T, t, dt

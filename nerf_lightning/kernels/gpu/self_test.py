@@ -94,7 +94,7 @@ def make_checks(device: torch.device) -> dict[str, tuple[Callable[..., Any], lis
     weights = rand(NUM_RAYS), rand(NUM_RAYS) < 0.5
     bits = rand(NUM_POSITIONS, 32).round()  # sums of products of few bits are exact in TF32
     edges, shares, main = rand(NUM_RAYS, 25).sort(1).values, rand(NUM_RAYS, 24) + 0.1, rand(NUM_RAYS, 16) / 16
-    room = replace(bounds, unbounded=True)
+    room = replace(bounds, unbounded=True, core=0.3 * bounds.aabb)
     exact = march_reference(rays, bounds, *limits[:-1])
     penalties = exact, 0.5, (1.0, 1.0, 1.0), rand(NUM_RAYS)
     return {
