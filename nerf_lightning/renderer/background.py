@@ -4,16 +4,18 @@ from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 
 from nerf_lightning.errors import InputError
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 SCENE_CHOICES = ("scene", "random", "auto")
+RANDOM_MEAN, RANDOM_VARIANCE = 0.5, 1 / 12
+"""Of a channel of a uniformly random color."""
 
 
 class Background(torch.nn.Module):
-    """Constant background color, or in training a random one per ray.
+    """Constant background color, or in training the mean of random ones, see `random_color_error`.
 
     Args:
         choice: see `VolumeRenderer`.
@@ -39,8 +41,19 @@ class Background(torch.nn.Module):
             raise InputError("renderer.background", "", repr(choice), expected)
         self.register_buffer("color", torch.tensor(color), persistent=False)
 
-    def sample(self, count: int, generator: Generator | None = None) -> Float[Tensor, "R 3"]:
-        """Background colors of `count` rays; random only with a generator (training)."""
-        if self.is_random and generator is not None:
-            return torch.rand(count, 3, generator=generator, device=self.color.device)
+    def expand(self, count: int, is_training: bool = False) -> Float[Tensor, "R 3"]:
+        """Background colors of `count` rays; in training the mean of random ones."""
+        if self.is_random and is_training:
+            return torch.full((count, 3), RANDOM_MEAN, device=self.color.device)
         return self.color.expand(count, 3)
+
+
+def random_color_error(
+    squared_errors: Float[Tensor, "R"], opacity: Float[Tensor, "R"], alpha: Float[Tensor, "R"]
+) -> Float[Tensor, "R"]:
+    """Expected squared error over uniformly random background colors, given that over their mean.
+
+    The error of a channel is e + (alpha - opacity) * (b - mean) for background b: its expected square adds the variance of b
+    times the squared error of the opacity. The mean over all colors has less noise than one color per ray.
+    """
+    return squared_errors + RANDOM_VARIANCE * (opacity - alpha).square()

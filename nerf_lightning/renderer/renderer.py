@@ -72,8 +72,8 @@ class VolumeRenderer(torch.nn.Module):
     """Volume rendering (NeRF, Mildenhall et al. 2020, eq. 3) over a background, and losses on the rendering weights.
 
     Args:
-        background: "scene" (the scene's color), "black", "white", "random" (random per training ray, "scene" in evaluation;
-            needs images with alpha), "auto" ("random" with alpha, else "scene"), or three numbers in [0, 1].
+        background: "scene" (the scene's color), "black", "white", "random" (in training the mean over random colors, "scene" in
+            evaluation; needs images with alpha), "auto" ("random" with alpha, else "scene"), or three numbers in [0, 1].
         scene_background: the color of "scene".
         distortion_loss_weight: weight of `distortion_loss`, against fog.
         near_loss_weight: initial weight of `near_loss`, against density near the cameras; it fades out.
@@ -113,7 +113,7 @@ class VolumeRenderer(torch.nn.Module):
     ) -> RenderOutput:
         """Renders rays over `backgrounds`, by default the renderer's background."""
         if backgrounds is None:
-            backgrounds = self.background.sample(len(rays))
+            backgrounds = self.background.expand(len(rays))
         density, rgb, view_residual = FieldOutput(*field(samples.positions(rays), samples.directions(rays)))
         has_gradient = density.requires_grad
         if samples.optical_depth is not None and not has_gradient:

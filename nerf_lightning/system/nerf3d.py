@@ -14,6 +14,7 @@ from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import RenderOutput, VolumeRenderer, composite_over
+from nerf_lightning.renderer.background import random_color_error
 from nerf_lightning.sampler import CHUNK, Sampler, Samples, split_by_rays
 from nerf_lightning.system.correction_trial import CorrectionTrials
 from nerf_lightning.system.growth import FieldGrowth, sync_resolution_scale
@@ -123,15 +124,17 @@ class NeRF3D(System):
             rays = self.corrections.poses(rays, batch.views)
         with torch.no_grad():
             samples = self.sampler(rays.detach(), maybe_compile(self.field.density, self.compile_backend), generator)
-        backgrounds = self.renderer.background.sample(len(rays), generator)
+        backgrounds = self.renderer.background.expand(len(rays), is_training=True)
         output = maybe_compile(self.renderer.forward, self.compile_backend)(rays, samples, self.field, backgrounds)
         truth, rgb = composite_over(batch.pixels, backgrounds), output.rgb
         if self.corrections is not None:
             assert batch.views is not None
             rgb = self.corrections.color(rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
-        if samples.complete is not None:  # truncated rays must not contribute
-            rgb = torch.where(samples.complete[:, None], rgb, truth)
         squared_errors = (rgb - truth).square().mean(1)
+        if self.renderer.background.is_random:
+            squared_errors = random_color_error(squared_errors, output.opacity, batch.pixels[:, 3] / 255)
+        if samples.complete is not None:  # truncated rays must not contribute
+            squared_errors = torch.where(samples.complete, squared_errors, 0.0)
         losses = {
             "photometric": (squared_errors if batch.weights is None else squared_errors * batch.weights).mean(),
             **self.regularize(output, samples, batch),
@@ -221,7 +224,7 @@ class NeRF3D(System):
         return [round(c, 3) for c in self.renderer.background.color.tolist()]
 
     def compute_target_rgb(self, batch: RayBatch) -> Tensor:
-        return composite_over(batch.pixels, self.renderer.background.sample(len(batch.rays)))
+        return composite_over(batch.pixels, self.renderer.background.expand(len(batch.rays)))
 
     def render_view(self, view: ViewBatch) -> tuple[Tensor, Tensor, Tensor]:
         rendered = self.render(view.rays)
