@@ -4,6 +4,7 @@ import argparse
 from contextlib import suppress
 from pathlib import Path
 from statistics import fmean
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ def render_object(name: str, size: int) -> Path:
         return path
     print(f"objects: rendering {path}", flush=True)
     train, val = make_hemisphere_cameras(TRAIN_VIEWS, size), make_hemisphere_cameras(VAL_VIEWS, size, 0.7)
-    tracer, arrays = Tracer(OBJECTS[name](np.random.default_rng(0))), {}
+    tracer, arrays = Tracer(OBJECTS[name](np.random.default_rng(0))), dict[str, Any]()
     for split, views in (("train", train), ("val", val)):
         arrays[f"images_{split}"] = np.stack([tracer.render(views, view) for view in range(len(views))])
         arrays[f"c2ws_{split}"] = views.c2w.numpy()

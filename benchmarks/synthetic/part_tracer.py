@@ -28,7 +28,7 @@ LAMPS = (((0.45, -0.35, 0.82), 90, 6), ((-0.8, 0.3, 0.5), 25, 1.4), ((0.2, 0.9, 
 class Layer(NamedTuple):
     """Nearest part at each pixel (-1: none), and where its ray enters and leaves it, along the camera's z axis."""
 
-    index: Int[np.ndarray, "H W"]
+    part: Int[np.ndarray, "H W"]
     near: Float[np.ndarray, "H W"]
     far: Float[np.ndarray, "H W"]
 
@@ -156,7 +156,7 @@ class Tracer:
         layers = [*(self.find_layer(number == k, fine, view) for k in translucent), opaque]  # front to back
         rgba, passed = np.zeros((fine.height, fine.width, 4)), np.ones((fine.height, fine.width))
         for layer in layers:
-            pixel = np.nonzero((layer.index >= 0) & (layer.near <= opaque.near))
+            pixel = np.nonzero((layer.part >= 0) & (layer.near <= opaque.near))
             k, t, far = (image[pixel] for image in layer)
             rays = np.stack([pixel[1] + 0.5, pixel[0] + 0.5, np.ones(len(k))], axis=1) @ lift.T
             length = np.linalg.norm(rays, axis=1)

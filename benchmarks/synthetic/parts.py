@@ -45,7 +45,7 @@ def make_wire(points: Float[np.ndarray, "N 3"] | list, radius: float, material: 
     """Makes a chain of cylinders."""
     ends = np.asarray(points, float)
     middles, halves = (ends[1:] + ends[:-1]) / 2, (ends[1:] - ends[:-1]) / 2
-    sizes = [(radius, radius, np.linalg.norm(half)) for half in halves]
+    sizes = [(radius, radius, float(np.linalg.norm(half))) for half in halves]
     return [make_part(CYLINDER, m, s, material, h) for m, s, h in zip(middles, sizes, halves, strict=True)]
 
 
