@@ -1,8 +1,8 @@
 """python -m benchmarks [PART ...] [KEY=VALUE ...]: runs benchmarks, which take minutes.
 
 Overrides KEY=VALUE apply to all trainings but the short ones. Tables and JSON go to `outputs/benchmarks/`. On a new GPU,
-run `agreement step_time methods` first: whether it agrees with the CPU, and how fast it is. The last line is then
-`all equal`, or lists the mismatches, and the exit code is 0 or 1.
+run `device` first, then `agreement`: how fast it is, and whether it agrees with the CPU. The last line is then
+`all equal`, or lists mismatches and failures, and the exit code is 0 or 1.
 """
 
 import argparse
@@ -24,9 +24,10 @@ from nerf_lightning.utils.files import write_json
 from nerf_lightning.utils.machine import describe_machine
 
 PARTS = {
+    "device": "one device in 8 minutes: GPU kernels, steps, profiles, PSNR over time, views, memory",
     "methods": "PSNR over training time of each method, trained as users do",
     "agreement": "kernels and short trainings on a device against plain PyTorch on the CPU",
-    "step_time": "a training step: time, operations, host syncs, memory, Lightning's overhead",
+    "step_time": "a training step: time, operations, bytes, host syncs, memory",
     "camera_noise": "loss by pose and exposure errors, and the gain of refine=auto",
     "capture_accuracy": "pose and lens errors of a synthetic capture with tags",
     "capture_quality": "photos with a background: PSNR, depth error and floaters",
@@ -37,7 +38,7 @@ PARTS = {
     "mesh_accuracy": "meshes against the true surfaces",
     "video": "frame selection from a video, and its registration by COLMAP",
 }
-"""Modules of this folder with a function `measure(args) -> list[dict]`, and their descriptions."""
+"""Modules of this folder with a function `measure(args)` that returns or yields rows, and their descriptions."""
 
 
 def parse_list(item_type: type) -> Any:
@@ -53,12 +54,19 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--experiments", type=parse_list(str), default=["lego", "lego_hashgrid", "lego_voxels"])
     parser.add_argument("--budgets", type=parse_list(float), default=[60.0], help="seconds of training")
     parser.add_argument("--seeds", type=parse_list(int), default=[0, 1, 2])
-    parser.add_argument("--scenes", type=parse_list(Path), default=[], help="for camera_noise and capture_quality")
-    parser.add_argument("--recipes", type=parse_list(str), default=[], help="for camera_noise, captures, objects")
+    parser.add_argument("--scenes", type=parse_list(Path), default=[], help="for device, camera_noise, capture_quality")
+    parser.add_argument(
+        "--recipes", type=parse_list(str), default=[], help="for device, camera_noise, captures, objects"
+    )
     parser.add_argument("--size", type=int, default=400, help="for objects: width of the photos, pixels")
-    parser.add_argument("--device", default="auto", help="for methods, agreement, step_time: auto, cpu, cuda or mps")
+    parser.add_argument(
+        "--device", default="auto", help="for device, methods, agreement, step_time: auto, cpu, cuda, mps"
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="for device: a trial of seconds, whose figures mean nothing"
+    )
     output = Path("outputs/benchmarks") / time.strftime("%Y-%m-%d_%H-%M-%S")
-    parser.add_argument("--output", type=Path, default=output)
+    parser.add_argument("--output", type=Path, default=output, help="folder, or name of the JSON file")
     return parser
 
 
@@ -66,6 +74,8 @@ def parse_args(argv: list[str] | None = None) -> argparse.Namespace:
     """Parses the command line, in which overrides may follow options."""
     parser = make_parser()
     args = parser.parse_intermixed_args(argv)
+    args.report = args.output if args.output.suffix == ".json" else args.output / "benchmarks.json"
+    args.output = args.report.parent
     args.overrides = [part for part in args.parts if "=" in part]
     args.parts = [part for part in args.parts if "=" not in part] or list(PARTS)
     if unknown := sorted({*args.parts} - {*PARTS}):
@@ -85,16 +95,19 @@ def main() -> None:
     report: dict[str, Any] = {"machine": machine, "overrides": args.overrides}
     console, all_rows = Console(record=True, width=240), Rows()
     print(f"device: {machine['accelerator'] or machine['processor']} ({args.device})", flush=True)
-    for part in args.parts:
-        rows = import_module(f"benchmarks.{part}").measure(args)
-        all_rows += rows
-        for name, table_rows in group_by_table(part, rows).items():
-            report[name] = table_rows
-            console.print(make_rich_table(name, table_rows))
     args.output.mkdir(parents=True, exist_ok=True)
+    for part in args.parts:
+        rows, tables = Rows(), {}
+        for row in import_module(f"benchmarks.{part}").measure(args):
+            rows.append(row)
+            tables = group_by_table(part, rows)
+            write_json(args.report, report | tables)  # what is measured stays if the machine goes away
+        report |= tables
+        all_rows += rows
+        for name, table_rows in tables.items():
+            console.print(make_rich_table(name, table_rows))
     console.save_text(str(args.output / "table.txt"))
-    write_json(args.output / "benchmarks.json", report)
-    print(f"written to {args.output}")
+    print(f"written to {args.report}")
     if any("differs" in row for row in all_rows):
         differences = list_differences(all_rows)
         print(f"not equal: {', '.join(differences)}" if differences else "all equal")

@@ -1,4 +1,4 @@
-"""Agreement of kernels and trainings on a device with plain PyTorch on the CPU, and the kernels' times.
+"""Agreement of kernels and trainings on a device with plain PyTorch on the CPU.
 
 Kernel versions and devices differ in summation order and fused multiply-adds: by about 1e-7 relative in a single number, 1e-5
 in a sum over thousands. Errors are far larger: half precision gives 1e-3, a missing sample or corner 1e-2 and more. Where a
@@ -8,10 +8,9 @@ position lies exactly on a cell border, rounding decides its cell: a few entries
 import argparse
 import io
 import math
-import time
 from contextlib import redirect_stdout
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean
 
 import torch
 from torch import Tensor
@@ -22,14 +21,12 @@ from benchmarks.methods import METHODS
 from benchmarks.tables import Row, Rows, name_tables
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.training.train import train
-from nerf_lightning.utils.device import CPU, synchronize
+from nerf_lightning.utils.device import CPU
 
 MAX_RELATIVE_ERROR = 1e-4
 """Largest difference of floats that count as equal, relative to the largest of them."""
 MAX_MISMATCH_RATIO = 1e-3
 """Largest fraction of integers or samples that may differ entirely."""
-TIMED_CALLS = 15
-"""Timed calls, of which the median counts."""
 STEPS = 400
 SCENE = ("dataset=bricks", "dataset.size=64", "dataset.train_views=40", "dataset.val_views=4")
 SMALL_BATCH = ("dataset.samples=8192", "sampler.samples=96")
@@ -49,7 +46,7 @@ DEVICE_ERRORS = (RuntimeError, TypeError)
 """Errors of PyTorch for unsupported operations and exhausted device memory."""
 
 
-def describe_failure(error: Exception) -> str:
+def describe_failure(error: BaseException) -> str:
     """Formats an error in one line."""
     return f"failed: {' '.join(str(error).split())[:200]}"
 
@@ -137,21 +134,6 @@ def run_case(case: Case, device: torch.device, choice: str) -> tuple[list[Tensor
     return [x.detach().cpu() for x in values], [x.cpu() for x in gradients]
 
 
-def time_case(case: Case, device: torch.device, choice: str) -> float:
-    """Median time of a version of a kernel, forward and backward, after two warm-up calls; milliseconds."""
-    times = []
-    with kernel_version(choice), torch.set_grad_enabled(case.num_trainable > 0):
-        inputs = case.to_device(device)
-        output_gradients = make_random_like(case.outputs(inputs))
-        for _ in range(2 + TIMED_CALLS):
-            synchronize(device)
-            start = time.perf_counter()
-            case.gradients(inputs, case.outputs(inputs), output_gradients)
-            synchronize(device)
-            times.append(time.perf_counter() - start)
-    return 1e3 * median(times[2:])
-
-
 def compare_kernel(case: Case, device: torch.device) -> Row:
     """Compares a kernel on a device with the reference on the CPU."""
     values, gradients = run_case(case, device, "auto")
@@ -165,11 +147,8 @@ def compare_kernel(case: Case, device: torch.device) -> Row:
         problems.append(f"{100 * mismatch:.3g}% of entries mismatch")
     if not gradient <= MAX_RELATIVE_ERROR:
         problems.append(f"gradient error {gradient:.1e}")
-    fast, reference = (time_case(case, device, choice) for choice in ("auto", "reference"))
-    gradient_error = gradient if case.num_trainable else None
-    errors = {"value_error": error, "mismatch_ratio": mismatch, "gradient_error": gradient_error}
-    times = {"fast_ms": fast, "reference_ms": reference, "speedup": reference / fast}
-    return {**errors, **times, "differs": "; ".join(problems)}
+    errors = {"value_error": error, "mismatch_ratio": mismatch}
+    return {**errors, "gradient_error": gradient if case.num_trainable else None, "differs": "; ".join(problems)}
 
 
 def compare_kernels(device: torch.device) -> Rows:

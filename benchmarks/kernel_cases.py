@@ -65,9 +65,9 @@ def kernel_version(choice: str) -> Iterator[None]:
 
 
 def march(unbounded: bool, capacity: int | None, *tensors: Tensor) -> Outputs:
-    origins, directions, aabb, near, far, shift, occupied = tensors
+    origins, directions, aabb, shift, occupied = tensors
     rays, bounds = Rays(origins, directions), Bounds(aabb, unbounded)
-    return kernels.march(rays, bounds, near, far, shift, occupied, MAX_STEPS, 3.46 / MAX_STEPS, capacity)
+    return kernels.march(rays, bounds, shift, occupied, MAX_STEPS, 3.46 / MAX_STEPS, capacity)
 
 
 def filter_visible(capacity: int | None, optical_depth: Tensor, *packed: Tensor) -> Outputs:
@@ -111,15 +111,15 @@ def hash_interpolate(grid: HashGrid, tables: Tensor, unit: Tensor) -> Tensor:
     return kernels.hash_interpolate(tables, unit, grid.cells, grid.sizes)
 
 
-def make_converging_rays(unbounded: bool) -> tuple[Tensor, ...]:
-    """Inputs of `march`: rays from a sphere of radius 4 toward the center of a box, the box, near, far, jitter, and a ball
-    of occupied cells."""
+def make_converging_rays() -> tuple[Tensor, ...]:
+    """Inputs of `march`: rays from a sphere of radius 4 toward the center of a box, the box, jitter, and a ball of
+    occupied cells."""
     origins = 4 * normalize(torch.randn(NUM_RAYS, 3), dim=1)
     directions = normalize(0.5 * torch.randn(NUM_RAYS, 3) - origins, dim=1)
     axis = (torch.arange(GRID_RESOLUTION) + 0.5) / (GRID_RESOLUTION / 2) - 1
     occupied = (axis[:, None, None] ** 2 + axis[:, None] ** 2 + axis**2 < 0.1).flatten()
-    box = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded)
-    return origins, directions, box.aabb, *box.near_far(Rays(origins, directions)), torch.rand(NUM_RAYS), occupied
+    box = torch.tensor([[-1.0, -1, -1], [1, 1, 1]])
+    return origins, directions, box, torch.rand(NUM_RAYS), occupied
 
 
 def sparsify(field: VoxelField) -> None:
@@ -148,7 +148,7 @@ def make_cases(choice: str = "reference") -> dict[str, Case]:
 
 def _make_cases() -> dict[str, Case]:
     torch.manual_seed(0)
-    bounded, unbounded = (make_converging_rays(boundless) for boundless in (False, True))
+    bounded, unbounded = make_converging_rays(), make_converging_rays()
     origins, directions, aabb = bounded[:3]
     packed = tuple(march(False, None, *bounded))
     t, dt, ray, _ = packed

@@ -25,8 +25,9 @@ def group_by_table(part: str, rows: Rows) -> dict[str, Rows]:
 
 
 def list_differences(rows: Rows) -> list[str]:
-    """Kernel or method and mismatch of each row that has one."""
-    return [f"{row.get('kernel') or row.get('method')} ({row['differs']})" for row in rows if row.get("differs")]
+    """Kernel, method or recipe and mismatch of each row that has one."""
+    names = "kernel", "method", "recipe"
+    return [f"{next(filter(None, map(row.get, names)))} ({row['differs']})" for row in rows if row.get("differs")]
 
 
 def compute_medians(rows: Rows) -> Row:

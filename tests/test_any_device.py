@@ -11,15 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from benchmarks.op_counter import OpCounter
+from benchmarks.step_time import Training
 from nerf_lightning.cli.evaluate import evaluate
 from nerf_lightning.cli.export import export_compact, export_mesh, export_points, export_voxels
 from nerf_lightning.cli.render import render
 from nerf_lightning.config.build import build_data, build_system, get_metadata
 from nerf_lightning.config.compose import compose_config
-from nerf_lightning.kernels import set_kernels
+from nerf_lightning.dataset import RayDataModule
+from nerf_lightning.kernels import gpu, set_kernels
 from nerf_lightning.runs.open import open_scene_run
+from nerf_lightning.synthetic.rooms import ROOMS, make_room_scene
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.system.growth import compute_next_stage, upsample_field
 from nerf_lightning.system.system import sum_losses
@@ -56,6 +60,14 @@ def small_options(name: str) -> list[str]:
 def build_system_and_data(given: list[str], folder: Path) -> tuple[System, object]:
     cfg = compose_config(given, folder)
     data = build_data(cfg)
+    return build_system(cfg, get_metadata(data)), data
+
+
+def build_capture(given: list[str], rays: int, folder: Path) -> tuple[System, RayDataModule]:
+    """A system as captures have it, and a small room."""
+    data = RayDataModule(make_room_scene(ROOMS["small subject"], 0, size=16, views=6, held_out=1), rays, None)
+    data.enable_texturelessness(True)
+    cfg = compose_config(["+experiment=capture", "dataset.path=room", *given], folder)
     return build_system(cfg, get_metadata(data)), data
 
 
@@ -132,6 +144,64 @@ def test_training_step_on_device_needs_few_operations_and_no_wait(name: str, dev
     for count in counts[-period + 3 :]:  # the first ones after an update make what is then kept for the device
         assert count.operations <= MAX_OPERATIONS[name], count.names.most_common()
     assert sum(count.waits for count in counts[-period:]) == 1, "to read the sample counts"
+
+
+LARGE_PLANES = [
+    f"model.{option}" for option in ("base_resolution=302", "max_resolution=302", "stages=1", "width=64", "size=fixed")
+]
+BYTES = {
+    "tensorf_medium": ([*LARGE_PLANES, "sampler.resolution=120"], 12_348, (457e3, 125e3), 1.34e9),
+    "hashgrid_medium": (["model.size=fixed"], 8446, (144e3, 53e3), 0.6e9),
+}
+"""Options, rays, their steps in occupied cells and visible ones, at photos of 800 pixels; bytes that a step moves at most."""
+
+
+class ZeroMemory(TorchDispatchMode):
+    """Zeroes new memory."""
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        out = function(*args, **(kwargs or {}))
+        return out.zero_() if "empty" in function._schema.name else out
+
+
+@pytest.mark.parametrize("recipe", BYTES)
+def test_training_step_with_gpu_kernels_moves_few_bytes(recipe: str, device: torch.device, tmp_path: Path, monkeypatch):
+    """The kernels' outputs stay zeros: between two reads of the sample counts, sizes follow from rays and capacities."""
+    pytest.importorskip("triton", "3.3", reason="the extra `test` installs triton on Linux")
+    given, rays, counts, max_bytes = BYTES[recipe]
+    small = [
+        "dataset=bricks",
+        "dataset.size=24",
+        "dataset.train_views=8",
+        "dataset.val_views=1",
+        "dataset.samples=null",
+    ]
+    options = [f"recipe={recipe}", *given, *small, f"dataset.rays={rays}", "limits.chunk_samples=524288"]
+    system, data = build_system_and_data(options, tmp_path)
+    system.to(device).sampler.capacity.per_ray = {False: tuple(count / rays for count in counts)}
+    training = Training(data, data.photos.to(device), system, system.configure_optimizers(), 16, 1, next_step=1)
+    monkeypatch.setattr(gpu.launch, "run_kernel", lambda *arguments: None)
+    set_kernels("triton")
+    with ZeroMemory():
+        training.step()  # makes what is cached from then on
+        with OpCounter() as count:
+            training.step()
+    assert count.bytes <= max_bytes, count.bytes_by_name.most_common(5)
+
+
+def test_rays_of_sixteen_steps_are_drawn_together(device: torch.device, tmp_path: Path):
+    _, data = build_system_and_data(small_options("hashgrid"), tmp_path)
+    views = data.photos.to(device)
+    data.draw_batch(views, 0, slice(None))
+    with OpCounter() as count:
+        batches = [data.draw_batch(views, step, slice(None)) for step in range(16, 32)]
+    assert count.operations <= 64 and count.waits == 0, count.names.most_common()
+    assert len({tuple(batch.rays.directions[0].tolist()) for batch in batches}) == 16
+    data.update_error_map(torch.ones(data.rays).to(device))
+    _, resumed = build_system_and_data(small_options("hashgrid"), tmp_path)
+    resumed.load_state_dict(data.state_dict())
+    pixels = [x.draw_batch(views, 21, slice(1, None, 2)).pixels.cpu() for x in (resumed, resumed)]
+    assert torch.equal(pixels[0], batches[5].pixels.cpu()[1::2]) and torch.equal(*pixels)
 
 
 @pytest.mark.parametrize("name", ["hashgrid2d", "picture_mlp", "fourier", "siren"])

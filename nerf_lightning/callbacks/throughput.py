@@ -42,7 +42,7 @@ class Throughput(L.Callback):
             scalars = {
                 **{f"loss/{name}": float(term) for name, term in stats.losses.items()},
                 "train/psnr": mse_to_psnr(float(stats.mse)),
-                **{f"lr/{group['name']}": group["lr"] for group in trainer.optimizers[0].param_groups},
+                **{f"lr/{group['name']}": float(group["lr"]) for group in trainer.optimizers[0].param_groups},
                 "speed/rays_per_second": rays / max(seconds - self._last_entry[0], 1e-9),
                 "speed/samples_per_ray": self._samples / max(rays, 1),
                 TRAIN_SECONDS_KEY: seconds,

@@ -41,12 +41,16 @@ class Bounds(TensorDataclass):
     max_half_size: float = field(init=False, repr=False)
     _low: Float[Tensor, "3"] = field(init=False, repr=False)
     _size: Float[Tensor, "3"] = field(init=False, repr=False)
+    _scale: Float[Tensor, "3"] = field(init=False, repr=False)
+    _offset: Float[Tensor, "3"] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         with torch.inference_mode(False):  # they enter autograd even if created in inference mode
             center, half_size = self.aabb.mean(0), (self.aabb[1] - self.aabb[0]) / 2
             derived = {"center": center, "half_size": half_size, "max_half_size": float(half_size.max())}
-            for name, value in (derived | {"_low": center - half_size, "_size": 2 * half_size}).items():
+            low, size = center - half_size, 2 * half_size
+            derived |= {"_low": low, "_size": size, "_scale": 1 / size, "_offset": -low / size}
+            for name, value in derived.items():
                 object.__setattr__(self, name, value)
 
     @property
@@ -70,8 +74,10 @@ class Bounds(TensorDataclass):
 
     def to_unit(self, positions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Maps world positions to [0, 1]^3, beyond it outside a bounded box; contracts those of an unbounded scene into it."""
-        if not self.unbounded:
+        if not self.unbounded and positions.device.type == "cpu":
             return (positions - self._low).div_(self._size)
+        if not self.unbounded:
+            return torch.addcmul(self._offset, positions, self._scale)  # a single kernel
         local = (positions - self.center) / self.half_size
         norm = local.abs().amax(-1, keepdim=True).clamp_min(1.0)
         return (2.0 - 1.0 / norm) * (local / norm) * 0.25 + 0.5

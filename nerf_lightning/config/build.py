@@ -30,7 +30,6 @@ from nerf_lightning.renderer import VolumeRenderer
 from nerf_lightning.renderer.background import Background
 from nerf_lightning.sampler import Sampler
 from nerf_lightning.system import NeRF2D, NeRF3D, System
-from nerf_lightning.system.torch_compile import COMPILE_BACKEND
 from nerf_lightning.utils.device import CPU, resolve_device
 from nerf_lightning.utils.option_checks import check_options
 
@@ -166,7 +165,6 @@ def build_system(cfg: DictConfig, metadata: "Metadata", device: torch.device = C
         raise InputError("config", "optimizer", f"{cfg.optimizer._target_} refuses its options: {error}") from error
     chunk = get_limits(cfg, device).chunk_samples
     common = {"optimizer": optimizer, "schedule": instantiate_node(cfg, "schedule"), "seed": cfg.seed, "chunk": chunk}
-    common["compile_backend"] = COMPILE_BACKEND if cfg.compile else None
     if isinstance(metadata, ImageMetadata):
         size = metadata.width, metadata.height
         return NeRF2D(build_field(cfg, PictureField, "two coordinates", size=size), **common)

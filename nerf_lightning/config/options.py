@@ -32,7 +32,6 @@ class RunOptions:
     threads: Annotated[Count, Le(1024)] | None
     device: str
     kernels: str
-    compile: bool
     resume: str | None
     overwrite: bool
     budget: dict

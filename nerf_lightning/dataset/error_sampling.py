@@ -48,8 +48,8 @@ class ErrorSampler:
         self.new_sums, self.new_counts = torch.zeros_like(self.valid_counts), torch.zeros_like(self.valid_counts)
         """Since the last update; errors in fixed point."""
         self.num_updates = 0
-        self.last_tiles = self.valid_counts[:0]
-        """Tiles of the last samples."""
+        self.pending: list[tuple[Tensor, Tensor, Tensor | None]] = []
+        """Tiles, errors and masks that are not in `new_sums` yet: summed together, as each operation is a launch on a GPU."""
         self._update_probabilities()
 
     def _locate_tiles(self, tiles: Int[Tensor, "T"]) -> tuple[Int[Tensor, "T"], ...]:
@@ -80,11 +80,13 @@ class ErrorSampler:
         self.ticket_ends = self.tickets.cumsum(0)
         self.num_tickets, self.num_valid = int(self.ticket_ends[-1]), int(self.valid_counts.sum())
 
-    def draw(self, count: int, generator: torch.Generator) -> tuple[Int[Tensor, "R"], Float[Tensor, "R"]]:
-        """Samples indices into `Views.pixels`, and their weights: 0 for masked pixels in tiles with valid ones."""
+    def draw(
+        self, count: int, generator: torch.Generator
+    ) -> tuple[Int[Tensor, "R"], Float[Tensor, "R"], Int[Tensor, "R"]]:
+        """Samples indices into `Views.pixels`, their weights (0 for masked pixels in tiles with valid ones), and tiles."""
         device = self.ticket_ends.device
         ticket = torch.randint(self.num_tickets, (count,), generator=generator, device=device)
-        self.last_tiles = tile = torch.searchsorted(self.ticket_ends, ticket, right=True)
+        tile = torch.searchsorted(self.ticket_ends, ticket, right=True)
         left, top, width, height, view = self._locate_tiles(tile)
         u, v = torch.rand(2, count, generator=generator, device=device)
         column, row = left + (u * width).long(), top + (v * height).long()
@@ -92,17 +94,17 @@ class ErrorSampler:
         weights = (self.num_tickets / self.num_valid) * (width * height / self.tickets[tile])
         if self.views.valid_mask is not None:
             weights = weights * self.views.mask[pixels]
-        return pixels, weights
+        return pixels, weights, tile
 
-    def update(self, errors: Float[Tensor, "R"], mask: Bool[Tensor, "R"] | None = None) -> None:
-        """Records the errors of the last samples, in [0, 1]; `mask` is False where none was measured."""
-        measured = torch.ones_like(self.last_tiles) if mask is None else mask.to(self.last_tiles.device, torch.long)
-        errors = errors.detach().to(self.last_tiles.device).nan_to_num(1.0).clamp(0, 1)
-        self.new_sums.index_add_(0, self.last_tiles, (errors * ERROR_SCALE).long() * measured)
-        self.new_counts.index_add_(0, self.last_tiles, measured)
+    def update(
+        self, tiles: Int[Tensor, "R"], errors: Float[Tensor, "R"], mask: Bool[Tensor, "R"] | None = None
+    ) -> None:
+        """Records the errors of samples in tiles, in [0, 1]; `mask` is False where none was measured."""
+        self.pending.append((tiles, errors.detach(), mask))
         self.num_updates += 1
         if self.num_updates % UPDATE_EVERY:
             return
+        self._sum_pending()
         self.sums += self.new_sums / ERROR_SCALE
         self.counts += self.new_counts
         decay = ERROR_WINDOW / self.counts.clamp_min(ERROR_WINDOW)
@@ -111,8 +113,23 @@ class ErrorSampler:
         self.new_counts.zero_()
         self._update_probabilities()
 
+    def _sum_pending(self) -> None:
+        if self.pending:
+            masks = [torch.ones_like(errors) if mask is None else mask for _, errors, mask in self.pending]
+            device, (tiles, errors, _) = self.new_sums.device, zip(*self.pending, strict=True)
+            tile, error, measured = (
+                torch.cat(tiles),
+                torch.cat(errors).to(device),
+                torch.cat(masks).to(device, torch.long),
+            )
+            fixed_point = (error.nan_to_num(1.0).clamp(0, 1) * ERROR_SCALE).long()
+            self.new_sums.index_add_(0, tile, fixed_point * measured)
+            self.new_counts.index_add_(0, tile, measured)
+            self.pending = []
+
     def state_dict(self) -> dict[str, Tensor]:
         """Everything that later samples depend on."""
+        self._sum_pending()
         return {name: getattr(self, name) for name in STATE_KEYS} | {"num_updates": torch.tensor(self.num_updates)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:

@@ -24,6 +24,11 @@ DEFAULT_RAYS, DEFAULT_SAMPLES = 1024, 16384
 ErrorSampling = Annotated[float, Ge(0), Le(0.99)]
 DEFAULT_ERROR_SAMPLING = 0.5
 """Fraction of the rays sampled by error."""
+STEPS_PER_DRAW = 16
+"""Steps whose rays are sampled together, and between adaptations of their number, where photos lie on an accelerator: each
+operation is a launch there."""
+RAY_DAMPING = 0.7
+"""Fraction of the last number of rays in the next: one batch's count is noisy."""
 BASELINE_PIXELS = 8192
 """Pixels on which the constant-color baseline is measured."""
 TEXTURE_RADIUS = 0.0125
@@ -136,6 +141,10 @@ class RayDataModule(StepDataModule[Views]):
         self.samples = samples
         self.error_sampling = error_sampling
         self._error_sampler: ErrorSampler | None = None
+        self._tiles: Tensor | None = None
+        """Tiles of the last step's rays; None for uniform sampling."""
+        self._block: tuple[tuple[int, int], RayBatch, Tensor | None] | None = None
+        """Step and number of rays of the last joint draw, its rays, and all processes' tiles."""
         self._sampler_state: dict[str, Tensor] = {}
         """Saved state that `_error_sampler` is created from."""
         self._with_texture = False
@@ -154,29 +163,46 @@ class RayDataModule(StepDataModule[Views]):
         """Scales the target samples with `Field.resolution_scale`: smaller cells get fewer samples and noisier gradients."""
         self._resolution_scale = scale
 
-    def adapt_num_rays(self, num_samples: int) -> None:
-        """Moves the number of rays toward the target samples, given those of the last step."""
+    def adapt_num_rays(self, num_samples: int, steps: int = 1) -> None:
+        """Moves the number of rays toward the target samples, given those of the last step, as `steps` calls would."""
         if self.samples is None:
             return
-        # Damped, since one batch's count is noisy; bounded, since empty space would need infinitely many rays.
         target = self.rays * round(self.samples * self._resolution_scale) / max(num_samples, 1)
-        limit = self.initial_rays * self.MAX_RAYS_FACTOR
-        self.rays = max(min(64, limit), min(limit, round(0.7 * self.rays + 0.3 * min(target, limit))))
+        limit = self.initial_rays * self.MAX_RAYS_FACTOR  # empty space would need infinitely many rays
+        damping = RAY_DAMPING**steps
+        self.rays = max(min(64, limit), min(limit, round(damping * self.rays + (1 - damping) * min(target, limit))))
 
     def update_error_map(self, errors: Float[Tensor, "R"], mask: Bool[Tensor, "R"] | None = None) -> None:
         """Records the squared errors of a step's rays, over all processes, for error sampling; `mask` as in `ErrorSampler`."""
-        if self._error_sampler is not None:
-            self._error_sampler.update(errors, mask)
+        if self._error_sampler is not None and self._tiles is not None:
+            self._error_sampler.update(self._tiles, errors, mask)
 
     def reset(self) -> None:
         """Resets the error map and the adaptive ray count for a new training."""
         self.rays = self.initial_rays
-        self._error_sampler, self._sampler_state = None, {}
+        self._error_sampler, self._sampler_state, self._block = None, {}, None
 
     def draw_batch(self, photos: Views, step: int, part: slice) -> RayBatch:
+        if photos.pixels.device.type == "cpu":
+            pixels, weights, self._tiles = self._draw_pixels(photos, step, self.rays)
+            return make_batch(photos, pixels[part], self._with_texture, None if weights is None else weights[part])
+        row = step % STEPS_PER_DRAW
+        key = step - row, self.rays
+        if self._block is None or self._block[0] != key:
+            drawn = self._draw_pixels(photos, step - row, STEPS_PER_DRAW * self.rays)
+            weights, tiles = (x if x is None else x.view(STEPS_PER_DRAW, -1) for x in drawn[1:])
+            pixels = drawn[0].view(STEPS_PER_DRAW, -1)[:, part].flatten()
+            own = None if weights is None else weights[:, part].flatten()
+            self._block = key, make_batch(photos, pixels, self._with_texture, own), tiles
+        _, block, tiles = self._block
+        self._tiles, size = None if tiles is None else tiles[row], len(block.pixels) // STEPS_PER_DRAW
+        return block[row * size : (row + 1) * size]
+
+    def _draw_pixels(self, photos: Views, step: int, count: int) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """Samples indices into `Views.pixels`, importance weights and tiles; the last two are None for uniform sampling."""
         generator = step_generator(self.seed, Stream.BATCH, step, photos.pixels.device)
         if self.error_sampling == 0:
-            return make_batch(photos, photos.sample_pixels(self.rays, generator)[part], self._with_texture)
+            return photos.sample_pixels(count, generator), None, None
         if self._error_sampler is None or self._error_sampler.views is not photos:
             if self._error_sampler is not None:
                 self._sampler_state = self._error_sampler.state_dict()
@@ -184,8 +210,7 @@ class RayDataModule(StepDataModule[Views]):
             # The state is empty, or of other photos, if the numbers of tiles differ.
             if len(self._sampler_state.get("sums", ())) == len(self._error_sampler.sums):
                 self._error_sampler.load_state_dict(self._sampler_state)
-        pixels, weights = self._error_sampler.draw(self.rays, generator)
-        return make_batch(photos, pixels[part], self._with_texture, weights[part])
+        return self._error_sampler.draw(count, generator)
 
     def make_baseline_batch(self) -> RayBatch:
         """Samples training pixels for the constant-color baseline."""
@@ -216,6 +241,6 @@ class RayDataModule(StepDataModule[Views]):
         return {"rays": self.rays, "error_sampler": state}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self._error_sampler, self._sampler_state = None, dict(state_dict["error_sampler"])
+        self._error_sampler, self._sampler_state, self._block = None, dict(state_dict["error_sampler"]), None
         if self.samples is not None:
             self.rays = min(self.initial_rays * self.MAX_RAYS_FACTOR, state_dict["rays"])

@@ -2,14 +2,11 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import torch
 
 T = TypeVar("T")
-
-CACHED_FUNCTIONS: list[Callable[..., Any]] = []
-"""Functions whose results are cached."""
 
 
 def cache_constants(make: Callable[..., T]) -> Callable[..., T]:
@@ -21,5 +18,4 @@ def cache_constants(make: Callable[..., T]) -> Callable[..., T]:
         with torch.inference_mode(False):
             return make(*arguments)
 
-    CACHED_FUNCTIONS.append(cached)
     return cached

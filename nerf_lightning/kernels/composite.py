@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from nerf_lightning.kernels import cpu, gpu
@@ -13,14 +13,18 @@ from nerf_lightning.kernels.segment_sums import exclusive_sum
 
 CompositedRays = tuple[Float[Tensor, "R 3"], Float[Tensor, "R"], Float[Tensor, "R"]]
 """Weighted sums of color, opacity and distance along each ray."""
-VisibleSamples = tuple[
-    Float[Tensor, "K"], tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
-]
-"""Optical depth of the K kept samples of N, and their `Packed` intervals."""
+PackedSelection = tuple[Float[Tensor, "K"], Float[Tensor, "K"], Int[Tensor, "K"], Int[Tensor, "R_plus_1"]]
+"""`Packed` intervals of K samples of N."""
+VisibleSamples = tuple[Float[Tensor, "K"], PackedSelection, Bool[Tensor, "R"] | None]
+"""Optical depth and intervals of the kept samples and, with a capacity, whether a ray has all: given and kept ones fitted."""
 
 
 def volume_weights(
-    density: Float[Tensor, "N"], dt: Float[Tensor, "N"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
+    density: Float[Tensor, "N"],
+    dt: Float[Tensor, "N"],
+    ray: Int[Tensor, "N"],
+    offsets: Int[Tensor, "R_plus_1"],
+    per_ray: int | None = None,
 ) -> Float[Tensor, "N"]:
     """Rendering weights w_i = T_i (1 - exp(-sigma_i dt_i)) with transmittance T_i = exp(-sum_{j < i} sigma_j dt_j).
 
@@ -29,12 +33,20 @@ def volume_weights(
         dt: interval lengths, world units.
         ray: ray of each sample, ascending.
         offsets: first sample of each ray, then N.
+        per_ray: samples of each ray, if all have as many.
 
     Returns:
         Weights in [0, 1]; their sum over a ray is its opacity.
     """
+    if per_ray and has_gpu_kernel(density, constants=(dt,)) and gpu.resampling.is_supported(dt.view(-1, per_ray)):
+        return gpu.resampling.IntervalWeights.apply(density, dt.view(-1, per_ray), 0.0, 1.0).flatten()
     exponent = -density * dt
     return -torch.exp(exclusive_sum(exponent, ray, offsets)) * torch.expm1(exponent)
+
+
+def interval_weights(optical_depth: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+    """Rendering weights from optical depths (density times length), see `volume_weights`."""
+    return torch.exp(optical_depth - optical_depth.cumsum(1)) * -torch.expm1(-optical_depth)
 
 
 def composite_reference(
@@ -111,11 +123,12 @@ def filter_visible_reference(
     if capacity is None:
         index, kept = keep.nonzero()[:, 0], counts.index_select(0, offsets)
         depths, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
-        return depths, (t, dt, ray, kept)
+        return depths, (t, dt, ray, kept), None
     index, is_real = first_true_indices(capacity, counts)
     kept = counts.index_select(0, offsets.clamp_max(len(keep)))  # a ray may end beyond the earlier call's capacity
+    complete = (offsets[1:] <= len(keep)) & (kept[1:] <= capacity)
     depths, t, dt, ray = (x.index_select(0, index) for x in (optical_depth, t, dt, ray))
-    return depths * is_real, (t, dt * is_real, ray, kept)
+    return depths * is_real, (t, dt * is_real, ray, kept), complete
 
 
 def filter_visible(
@@ -149,4 +162,4 @@ def filter_visible(
     kept = offsets_from_counts(counts)
     out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
     cpu.composite.pack_visible(keep, offsets, kept, optical_depth, t, dt, out, rays)
-    return out[0], (out[1], out[2], rays, kept)
+    return out[0], (out[1], out[2], rays, kept), None

@@ -8,56 +8,44 @@ from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.backend import has_fast_kernel
 from nerf_lightning.kernels.cached_constants import cache_constants
 
-# Monomials of degree 2 and 3 in the harmonics, as indices of their factors.
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))
-TRIPLES = tuple((pair, axis) for pair in (0, 1, 2) for axis in (0, 1, 2)) + ((3, 2),)
-_XX, _YY, _ZZ, _XY, _YZ, _XZ = range(3, 9)
-
-
-def _cubic(pair: int, axis: int) -> int:
-    return 9 + TRIPLES.index((pair - 3, axis))
-
-
-# Coefficients of the monomials in each function; the first function is constant.
-TERMS: tuple[dict[int, float], ...] = (
-    {},
-    {1: -0.48860251190291987},
-    {2: 0.48860251190291987},
-    {0: -0.48860251190291987},
-    {_XY: 1.0925484305920792},
-    {_YZ: -1.0925484305920792},
-    {_ZZ: 3 * 0.31539156525252005},
-    {_XZ: -1.0925484305920792},
-    {_XX: 0.5462742152960396, _YY: -0.5462742152960396},
-    {_cubic(_XX, 1): -3 * 0.5900435899266435, _cubic(_YY, 1): 0.5900435899266435},
-    {_cubic(_XY, 2): 2.890611442640554},
-    {_cubic(_ZZ, 1): -5 * 0.4570457994644657, 1: 0.4570457994644657},
-    {_cubic(_ZZ, 2): 5 * 0.3731763325901154, 2: -3 * 0.3731763325901154},
-    {_cubic(_ZZ, 0): -5 * 0.4570457994644657, 0: 0.4570457994644657},
-    {_cubic(_XX, 2): 1.445305721320277, _cubic(_YY, 2): -1.445305721320277},
-    {_cubic(_XX, 0): -0.5900435899266435, _cubic(_YY, 0): 3 * 0.5900435899266435},
+_X, _Y, _Z, _ONE = (1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, 1.0)
+_R3, _R5 = 3**0.5, 5**0.5
+_PLUS, _MINUS = (1.0, 1, 0, 0), (1.0, -1, 0, 0)
+_Z2, _Z3 = ((0, 0, _R5, -1.0), (0, 0, _R5, 1.0)), ((0, 0, _R5, -_R3), (0, 0, _R5, _R3))
+# On the unit sphere each function is a coefficient times three linear factors of (x, y, z, 1).
+FACTORS = (
+    (0.28209479177387814, _ONE, _ONE, _ONE),
+    (-0.48860251190291987, _Y, _ONE, _ONE),
+    (0.48860251190291987, _Z, _ONE, _ONE),
+    (-0.48860251190291987, _X, _ONE, _ONE),
+    (1.0925484305920792, _X, _Y, _ONE),
+    (-1.0925484305920792, _Y, _Z, _ONE),
+    (0.31539156525252005, (0, 0, _R3, -1.0), (0, 0, _R3, 1.0), _ONE),
+    (-1.0925484305920792, _X, _Z, _ONE),
+    (0.5462742152960396, _PLUS, _MINUS, _ONE),
+    (-0.5900435899266435, _Y, (_R3, -1.0, 0, 0), (_R3, 1.0, 0, 0)),
+    (2.890611442640554, _X, _Y, _Z),
+    (-0.4570457994644657, _Y, *_Z2),
+    (0.3731763325901154, _Z, *_Z3),
+    (-0.4570457994644657, _X, *_Z2),
+    (1.445305721320277, _Z, _PLUS, _MINUS),
+    (-0.5900435899266435, _X, (1.0, -_R3, 0, 0), (1.0, _R3, 0, 0)),
 )
-CONSTANTS = {0: 0.28209479177387814, 6: -0.31539156525252005}
 
 
 @cache_constants
-def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, list[Tensor]]:
-    """Coefficients of all monomials, constants, and indices of the factors of pairs and triples."""
-    factors = [[terms.get(power, 0.0) for terms in TERMS] for power in range(9 + len(TRIPLES))]
-    constants = [CONSTANTS.get(function, 0.0) for function in range(len(TERMS))]
-    firsts, seconds, pairs, axes = (list(column) for both in (PAIRS, TRIPLES) for column in zip(*both, strict=True))
-    columns = [torch.tensor(column, device=device) for column in (firsts + seconds + axes, pairs)]
-    matrix, bias = (torch.tensor(values, dtype=dtype, device=device) for values in (factors, constants))
-    return matrix, bias, columns
+def _factors(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, "48"], Float[Tensor, "3 48"]]:
+    """Constants and matrix of all factors, those of a place in the product one after the other."""
+    scaled = [[c * first for first in first_factor] for c, first_factor, _, _ in FACTORS]
+    rows = [*scaled, *(row[place] for place in (2, 3) for row in FACTORS)]
+    matrix = torch.tensor(rows, dtype=dtype, device=device)
+    return matrix[:, 3].contiguous(), matrix[:, :3].T.contiguous()
 
 
 def spherical_harmonics_reference(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:
-    """`spherical_harmonics` in plain PyTorch, for every device and precision, as one matrix product."""
-    factors, constants, (coordinates, pair) = _tables(d.dtype, d.device)
-    first, second, axis = d.index_select(1, coordinates).split([len(PAIRS), len(PAIRS), len(TRIPLES)], dim=1)
-    pairs = first * second
-    triples = pairs.index_select(1, pair) * axis
-    return torch.addmm(constants, torch.cat([d, pairs, triples], dim=1), factors)
+    """`spherical_harmonics` in plain PyTorch, for every device and precision, in two operations."""
+    constants, matrix = _factors(d.dtype, d.device)
+    return torch.addmm(constants, d, matrix).view(len(d), 3, 16).prod(1)
 
 
 def spherical_harmonics(d: Float[Tensor, "N 3"]) -> Float[Tensor, "N 16"]:

@@ -76,13 +76,13 @@ def pack_intervals(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]
 
 
 def march_reference(
-    rays: Rays, bounds: Bounds, near: Tensor, far: Tensor, shift: Tensor, occupied: Tensor,
+    rays: Rays, bounds: Bounds, shift: Tensor, occupied: Tensor,
     samples: int, step: float, capacity: int | None = None, chunk: int = INTERVALS_PER_CHUNK,
 ) -> Packed:  # fmt: skip
     """`march` in plain PyTorch, for every device."""
-    resolution = round(len(occupied) ** (1 / 3))
+    (near, far), resolution = bounds.near_far(rays), round(len(occupied) ** (1 / 3))
     # One more than `samples`: the shift may shorten the first step, and the last must reach the far end.
-    steps = torch.arange(-0.5, samples + 1, device=near.device) + shift[:, None]
+    steps = torch.arange(-0.5, samples + 1, device=shift.device) + shift[:, None]
     if bounds.unbounded:
         edges = bounds.s_to_t(rays, near, far, (steps / samples).clamp(0, 1))
     else:
@@ -101,8 +101,6 @@ def march_reference(
 def march(
     rays: Rays,
     bounds: Bounds,
-    near: Float[Tensor, "R"],
-    far: Float[Tensor, "R"],
     shift: Float[Tensor, "R"],
     occupied: Bool[Tensor, "cells"],
     samples: int,
@@ -110,11 +108,10 @@ def march(
     capacity: int | None = None,
     chunk: int = INTERVALS_PER_CHUNK,
 ) -> Packed:
-    """Ray marching from near to far that keeps the steps with a midpoint in an occupied cell.
+    """Ray marching through the bounds that keeps the steps with a midpoint in an occupied cell.
 
     Args:
         rays, bounds: in world units.
-        near, far: distances along each ray; none where near >= far.
         shift: jitter of each ray's steps, in steps, in [0, 1).
         occupied: cells of a cubic grid over the bounds' unit cube, last axis fastest.
         samples: steps of an unbounded ray, spaced by `Bounds.s_to_t`; inside bounds at most samples + 1.
@@ -123,12 +120,12 @@ def march(
             length 0; rays whose `offsets` end beyond it are truncated.
         chunk: intervals that the reference tests at a time, to bound its memory.
     """
-    inputs = rays.origins, rays.directions, near, far, shift
+    inputs = rays.origins, rays.directions, shift
     if not bounds.unbounded and has_gpu_kernel(constants=inputs):
-        return gpu.march.march(rays, bounds, near, far, shift, occupied, samples, step, capacity)
+        return gpu.march.march(rays, bounds, shift, occupied, samples, step, capacity)
     if capacity is not None or not has_fast_kernel(constants=inputs):
-        return march_reference(rays, bounds, near, far, shift, occupied, samples, step, capacity, chunk)
-    marcher = RayMarcher(rays, bounds, near, far, shift, occupied, samples, step)
+        return march_reference(rays, bounds, shift, occupied, samples, step, capacity, chunk)
+    marcher = RayMarcher(rays, bounds, shift, occupied, samples, step)
     return marcher.advance(torch.arange(len(rays)), samples + 1)
 
 
@@ -139,14 +136,12 @@ class RayMarcher:
         self,
         rays: Rays,
         bounds: Bounds,
-        near: Float[Tensor, "R"],
-        far: Float[Tensor, "R"],
         shift: Float[Tensor, "R"],
         occupied: Bool[Tensor, "cells"],
         samples: int,
         step: float,
     ):
-        resolution = round(len(occupied) ** (1 / 3))
+        (near, far), resolution = bounds.near_far(rays), round(len(occupied) ** (1 / 3))
         cells, block_bits = resolution, occupied
         if resolution % BLOCK == 0:
             cells = resolution // BLOCK
@@ -201,9 +196,11 @@ def ray_positions(
     origins: Float[Tensor, "R 3"], directions: Float[Tensor, "R 3"], ray: Int[Tensor, "N"], t: Float[Tensor, "N"]
 ) -> Float[Tensor, "N 3"]:
     """Positions at distances `t` along the rays with indices `ray`."""
-    if not has_fast_kernel(origins, directions, constants=(t,)):
-        return ray_positions_reference(origins, directions, ray, t)
-    return _RayPositions.apply(origins, directions, ray, t)
+    if has_fast_kernel(origins, directions, constants=(t,)):
+        return _RayPositions.apply(origins, directions, ray, t)
+    if has_gpu_kernel(constants=(origins, directions, t)):
+        return gpu.march.ray_positions(origins, directions, ray, t)
+    return ray_positions_reference(origins, directions, ray, t)
 
 
 def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions: Float[Tensor, "N 3"]) -> None:
@@ -211,5 +208,7 @@ def mark_cells(marks: Int[Tensor, "cells"], mark: int, bounds: Bounds, positions
     resolution = round(len(marks) ** (1 / 3))
     if has_fast_kernel(positions):
         cpu.march.mark_cells(positions.T, bounds.center, bounds.half_size, bounds.unbounded, marks, resolution, mark)
+    elif not bounds.unbounded and has_gpu_kernel(positions):
+        gpu.march.mark_cells(marks, mark, bounds, positions)
     else:
         marks.index_fill_(0, cell_index(bounds.to_unit(positions), resolution), mark)

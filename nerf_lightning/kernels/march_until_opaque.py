@@ -19,8 +19,6 @@ FIRST_STEPS_PER_RAY = 4
 def march_until_opaque(
     rays: Rays,
     bounds: Bounds,
-    near: Float[Tensor, "R"],
-    far: Float[Tensor, "R"],
     shift: Float[Tensor, "R"],
     occupied: Bool[Tensor, "cells"],
     samples: int,
@@ -33,12 +31,12 @@ def march_until_opaque(
     """Optical depths and intervals of `march`; the fast version may omit occluded ones.
 
     Args:
-        rays, bounds, near, far, shift, occupied, samples, step, capacity, chunk: see `march`.
+        rays, bounds, shift, occupied, samples, step, capacity, chunk: see `march`.
         optical_depth: function that returns the optical depth of intervals.
         early_stop_eps: transmittance below which a ray ends, above 0.
     """
-    arguments = rays, bounds, near, far, shift, occupied, samples, step
-    if capacity is not None or not has_fast_kernel(constants=(rays.origins, rays.directions, near, far, shift)):
+    arguments = rays, bounds, shift, occupied, samples, step
+    if capacity is not None or not has_fast_kernel(constants=(rays.origins, rays.directions, shift)):
         packed = march(*arguments, capacity, chunk)
         return optical_depth(packed), packed
     marcher, max_depth, max_intervals = RayMarcher(*arguments), -math.log(early_stop_eps), FIRST_STEPS_PER_RAY

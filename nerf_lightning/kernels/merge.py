@@ -6,14 +6,16 @@ from torch import Tensor
 
 from nerf_lightning.kernels import cpu
 from nerf_lightning.kernels.backend import has_fast_kernel
-from nerf_lightning.kernels.composite import VisibleSamples, volume_weights
+from nerf_lightning.kernels.composite import PackedSelection, volume_weights
 from nerf_lightning.kernels.march import Packed, offsets_from_counts
 
+MergedSamples = tuple[Float[Tensor, "K"], PackedSelection]
+"""Optical depth of the K remaining samples, and their intervals."""
 MAX_MIDPOINT_DISTANCE = 0.625
 """Maximum distance of adjacent midpoints relative to the sum of lengths: 0.5 if they touch, 0.75 or more with a gap."""
 
 
-def merge_low_weight_reference(optical_depth: Tensor, packed: Packed, min_weight: float) -> VisibleSamples:
+def merge_low_weight_reference(optical_depth: Tensor, packed: Packed, min_weight: float) -> MergedSamples:
     """`merge_low_weight` in plain PyTorch, for every device."""
     t, dt, ray, offsets = packed
     weights = volume_weights(optical_depth, torch.ones_like(optical_depth), ray, offsets)
@@ -38,7 +40,7 @@ def merge_low_weight_reference(optical_depth: Tensor, packed: Packed, min_weight
     return merge_values(optical_depth, optical_depth), packed
 
 
-def merge_low_weight(optical_depth: Float[Tensor, "N"], packed: Packed, min_weight: float) -> VisibleSamples:
+def merge_low_weight(optical_depth: Float[Tensor, "N"], packed: Packed, min_weight: float) -> MergedSamples:
     """Merges a sample into its predecessor if the weight of either is below `min_weight`, at most two into one.
 
     The merged interval has the summed length and optical depth, which preserves opacity, and the weighted mean of t, which

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import linear
 
 from nerf_lightning.kernels import cpu, gpu
+from nerf_lightning.kernels.activation import Activation, activate, truncated_exp
 from nerf_lightning.kernels.backend import has_fast_kernel, has_gpu_kernel
 
 Layers = Sequence[tuple[Float[Tensor, "_ _"], Float[Tensor, "_"]]]
@@ -63,25 +64,33 @@ class _MLP(torch.autograd.Function):
 
 
 def mlp_heads(
-    x: Float[Tensor, "N I"], layers: Layers, num_head: int, extra: Float[Tensor, "N E"] | None = None
-) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:
-    """`mlp` that returns the first `num_head` outputs and the rest separately, without a split."""
+    x: Float[Tensor, "N I"], layers: Layers, num_head: int, extra: Float[Tensor, "N E"] | None = None,
+    activation: Activation = None, scale: float = 1.0,
+) -> tuple[Float[Tensor, "N first"], Float[Tensor, "N rest"]]:  # fmt: skip
+    """`mlp` that returns the first `num_head` outputs, with an activation divided by `scale`, and the rest separately."""
     parameters = [parameter for layer in layers for parameter in layer]
     rest = x.new_empty(len(x), 0) if extra is None else extra.detach()
     if has_fast_kernel(x, *parameters, rest):
-        return _MLP.apply(x, rest, num_head, *parameters)
-    if has_gpu_kernel(x, *parameters, rest) and gpu.mlp.is_supported(layers, rest.shape[1], x.device):
-        return gpu.mlp.MLP.apply(x, rest, num_head, *parameters)
-    out = mlp_reference(x, layers, rest)
-    return out[:, :num_head], out[:, num_head:]
+        head, others = _MLP.apply(x, rest, num_head, *parameters)
+    elif has_gpu_kernel(x, *parameters, rest) and gpu.mlp.is_supported(layers, rest.shape[1], x.device):
+        if activation in gpu.mlp.ACTIVATIONS and (scale == 1 or activation is truncated_exp):
+            return gpu.mlp.MLP.apply(x, rest, num_head, activation, scale, *parameters)
+        head, others = gpu.mlp.MLP.apply(x, rest, num_head, None, 1.0, *parameters)
+    else:
+        out = mlp_reference(x, layers, rest)
+        head, others = out[:, :num_head], out[:, num_head:]
+    return activate(head, activation, scale), others
 
 
-def mlp(x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None) -> Float[Tensor, "N O"]:
+def mlp(
+    x: Float[Tensor, "N I"], layers: Layers, extra: Float[Tensor, "N E"] | None = None, activation: Activation = None
+) -> Float[Tensor, "N O"]:
     """Linear layers with ReLU between them.
 
     Args:
         x: inputs.
         layers: matrix [outputs, inputs] and bias of each layer.
         extra: further inputs after `x`, without gradient.
+        activation: of the outputs.
     """
-    return mlp_heads(x, layers, 0, extra)[1]
+    return mlp_heads(x, layers, len(layers[-1][1]), extra, activation)[0]

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from nerf_lightning.kernels import cpu, gpu
+from nerf_lightning.kernels.activation import Activation, activate, truncated_exp
 from nerf_lightning.kernels.backend import has_fast_kernel, has_gpu_kernel
 from nerf_lightning.kernels.cached_constants import cache_constants
 
@@ -136,24 +137,31 @@ def plane_line_products(
 
 
 def plane_line_sum(
-    planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"]
-) -> Float[Tensor, "N"]:
-    """Sum of `plane_line_products` at each position."""
+    planes: Float[Tensor, "3 S S C"], lines: Float[Tensor, "3 S C"], unit: Float[Tensor, "N 3"],
+    activation: Activation = None, scale: float = 1.0,
+) -> Float[Tensor, "N"]:  # fmt: skip
+    """Sum of `plane_line_products` at each position, with an activation divided by `scale`."""
     if has_fast_kernel(planes, lines, unit):
-        return _PlaneLine.apply(planes, lines, unit, True)[:, 0]
-    if has_gpu_kernel(planes, lines, constants=(unit,)):
-        return gpu.vector_matrix.PlaneLine.apply(planes, lines, unit, True)
-    return products_reference((planes, lines), unit=unit)[0].sum((1, 2))
+        total = _PlaneLine.apply(planes, lines, unit, True)[:, 0]
+    elif has_gpu_kernel(planes, lines, constants=(unit,)):
+        if activation is truncated_exp:
+            return gpu.vector_matrix.PlaneLine.apply(planes, lines, unit, True, True, scale)
+        total = gpu.vector_matrix.PlaneLine.apply(planes, lines, unit, True)
+    else:
+        total = products_reference((planes, lines), unit=unit)[0].sum((1, 2))
+    return activate(total, activation, scale)
 
 
 def plane_line_sum_and_products(
     summed: tuple[Float[Tensor, "3 S S A"], Float[Tensor, "3 S A"]],
     separate: tuple[Float[Tensor, "3 S S B"], Float[Tensor, "3 S B"]],
     unit: Float[Tensor, "N 3"],
+    activation: Activation = None,
+    scale: float = 1.0,
 ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N threeB"]]:
     """`plane_line_sum` of one volume and `plane_line_products` of another of the same resolution."""
     is_on_gpu = has_gpu_kernel(*summed, *separate, constants=(unit,))
     if is_on_gpu or has_fast_kernel(*summed, *separate, unit):
-        return plane_line_sum(*summed, unit), plane_line_products(*separate, unit)
+        return plane_line_sum(*summed, unit, activation, scale), plane_line_products(*separate, unit)
     total, products = products_reference(summed, separate, unit=unit)
-    return total.sum((1, 2)), products.flatten(1)
+    return activate(total.sum((1, 2)), activation, scale), products.flatten(1)

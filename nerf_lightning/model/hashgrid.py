@@ -159,14 +159,21 @@ class HashGridField(Field):
     def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
         self.grid.prune(visible_cells)
 
-    def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
-        encoded = self.grid(self.bounds.to_unit(positions))
-        raw, geometry = mlp_heads(encoded, layer_parameters(self.density_net), 1)
-        return self.activation(raw.squeeze(1)), geometry
+    def features(
+        self, positions: Float[Tensor, "N 3"], unit_length: float = 1.0
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+        """See `Field.features`; the density is divided by `unit_length`."""
+        encoded, layers = self.grid(self.bounds.to_unit(positions)), layer_parameters(self.density_net)
+        density, geometry = mlp_heads(encoded, layers, 1, None, self.activation, unit_length)
+        return density.squeeze(1), geometry
+
+    def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
+        return self.features(positions, self.unit_length)[0]
 
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
-        density, features = self.features(positions)
-        logits = mlp(features, layer_parameters(self.color_net), encode_directions(directions, self.terms))
+        density, features = self.features(positions, self.unit_length)
+        layers, basis = layer_parameters(self.color_net), encode_directions(directions, self.terms)
         if not self.view_residual:
-            return FieldOutput(density / self.unit_length, torch.sigmoid(logits))
-        return FieldOutput(density / self.unit_length, torch.sigmoid(features[:, :3] + logits), logits)
+            return FieldOutput(density, mlp(features, layers, basis, torch.sigmoid))
+        logits = mlp(features, layers, basis)
+        return FieldOutput(density, torch.sigmoid(features[:, :3] + logits), logits)

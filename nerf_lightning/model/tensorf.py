@@ -11,7 +11,7 @@ from nerf_lightning.cameras import Bounds
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import mlp, plane_line_sum, plane_line_sum_and_products
 from nerf_lightning.kernels.vector_matrix import PLANE_AXES
-from nerf_lightning.model.field import Field, Size
+from nerf_lightning.model.field import Field, FieldOutput, Size
 from nerf_lightning.model.growth import ResolutionSchedule, replace_data
 from nerf_lightning.model.hashgrid import level_resolutions
 from nerf_lightning.model.layers.activation import Activation, density_activation
@@ -48,10 +48,6 @@ class VectorMatrix(torch.nn.Module):
     def cells(self) -> int:
         """Current cells along each side."""
         return self.lines.shape[1] - 1
-
-    def sum_components(self, unit: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
-        """Sum of all components at positions in the unit cube."""
-        return plane_line_sum(self.planes, self.lines, unit)
 
     @torch.no_grad()
     def resize(self, cells: int) -> None:
@@ -163,19 +159,26 @@ class TensoRFField(Field):
     def resolution_scale(self) -> float:
         return max(1.0, self.density_volume.cells / DEFAULT_MAX_RESOLUTION) if self.has_auto_resolution else 1.0
 
-    def features(self, positions: Float[Tensor, "N 3"]) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+    def features(
+        self, positions: Float[Tensor, "N 3"], unit_length: float = 1.0
+    ) -> tuple[Float[Tensor, "N"], Float[Tensor, "N F"]]:
+        """See `Field.features`; the density is divided by `unit_length`."""
         density, color = self.density_volume, self.color_volume
         factors = (density.planes, density.lines), (color.planes, color.lines)
-        total, products = plane_line_sum_and_products(*factors, self.bounds.to_unit(positions))
-        return self.activation(total), products
+        return plane_line_sum_and_products(*factors, self.bounds.to_unit(positions), self.activation, unit_length)
 
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         """Density of `forward`, without computing the color."""
-        return self.activation(self.density_volume.sum_components(self.bounds.to_unit(positions))) / self.unit_length
+        factors, unit = (self.density_volume.planes, self.density_volume.lines), self.bounds.to_unit(positions)
+        return plane_line_sum(*factors, unit, self.activation, self.unit_length)
+
+    def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
+        density, features = self.features(positions, self.unit_length)
+        return FieldOutput(density, self.color(features, directions))
 
     def color(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
         basis = encode_directions(directions, self.terms)
-        return torch.sigmoid(mlp(features, layer_parameters(self.color_net), basis))
+        return mlp(features, layer_parameters(self.color_net), basis, torch.sigmoid)
 
     def prune(self, visible_cells: Bool[Tensor, "G G G"]) -> None:
         self.density_volume.prune(visible_cells)

@@ -16,11 +16,11 @@ from nerf_lightning.kernels import (
     locate_vertices,
     mark_rows,
     total_variation,
+    truncated_exp,
 )
 from nerf_lightning.model.field import Field, FieldOutput, Size
 from nerf_lightning.model.growth import ResolutionSchedule, replace_data
 from nerf_lightning.model.hashgrid import level_resolutions
-from nerf_lightning.model.layers.activation import truncated_exp
 from nerf_lightning.model.layers.encoding import encode_directions, num_sh_bases
 from nerf_lightning.model.layers.grid_masks import dilate, vertices_of_cells
 from nerf_lightning.utils.option_checks import GridSize, Gt, Layers, Le, LossWeight, PositiveFloat, SHDegree
@@ -136,7 +136,6 @@ class VoxelField(Field):
             self.mark_read(rows)
         return FieldOutput(self.density_from_raw(raw), torch.sigmoid(rgb))
 
-    @torch.compiler.disable  # each step would recompile
     def mark_read(self, rows: Int[Tensor, "N 8"]) -> None:
         """Records the rows read by a training step."""
         self.steps += 1

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import mean_squared_error
 
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 SCENE_CHOICES = ("scene", "random", "auto")
@@ -15,7 +16,7 @@ RANDOM_MEAN, RANDOM_VARIANCE = 0.5, 1 / 12
 
 
 class Background(torch.nn.Module):
-    """Constant background color, or in training the mean of random ones, see `random_color_error`.
+    """Constant background color, or in training the mean of random ones, see `opacity_loss`.
 
     Args:
         choice: see `VolumeRenderer`.
@@ -48,12 +49,16 @@ class Background(torch.nn.Module):
         return self.color.expand(count, 3)
 
 
-def random_color_error(
-    squared_errors: Float[Tensor, "R"], opacity: Float[Tensor, "R"], alpha: Float[Tensor, "R"]
-) -> Float[Tensor, "R"]:
-    """Expected squared error over uniformly random background colors, given that over their mean.
+def opacity_loss(
+    opacity: Float[Tensor, "R"],
+    pixels: UInt8[Tensor, "R 4"],
+    weights: Float[Tensor, "R"] | None,
+    complete: Bool[Tensor, "R"] | None,
+) -> Float[Tensor, ""]:
+    """What random background colors add to the photometric loss on their mean; arguments as in `photometric_loss`.
 
-    The error of a channel is e + (alpha - opacity) * (b - mean) for background b: its expected square adds the variance of b
-    times the squared error of the opacity. The mean over all colors has less noise than one color per ray.
+    A channel's error on a background b is e + (alpha - opacity) * (b - mean): its expected square adds the variance of b times
+    the squared error of the opacity. This mean over all colors has less noise than one color per ray.
     """
-    return squared_errors + RANDOM_VARIANCE * (opacity - alpha).square()
+    alpha = pixels[:, 3:] / 255
+    return RANDOM_VARIANCE * mean_squared_error(opacity[:, None], alpha, weights, complete)[0]

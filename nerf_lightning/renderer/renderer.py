@@ -5,17 +5,22 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.kernels import composite, volume_weights
+from nerf_lightning.kernels import composite, volume_weights, weight_losses
 from nerf_lightning.kernels.segment_sums import exclusive_sum
 from nerf_lightning.model import FieldOutput
 from nerf_lightning.renderer.background import Background
-from nerf_lightning.renderer.losses import AUTO_VIEW_LOSS_WEIGHT, NEAR_LOSS_END, distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 from nerf_lightning.utils.option_checks import LossWeight
+
+NEAR_LOSS_END = 0.7
+"""Training progress at which the near loss has faded out, so that surfaces it pushed back can recover."""
+AUTO_VIEW_LOSS_WEIGHT = {False: 0.01, True: 0.001}
+"""Automatic weight of the view loss, by `unbounded`. A bounded subject was often turned before the camera, with the light
+fixed; in unbounded scenes view dependence also absorbs exposure changes."""
 
 FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], FieldOutput | tuple[Tensor, Tensor]]
 """World positions and unit directions -> density (1 / world unit) and rgb in [0, 1], see `FieldOutput`."""
@@ -25,29 +30,30 @@ FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], FieldOutput | t
 class RenderOutput:
     """Rendered rays."""
 
-    rgb: Float[Tensor, "R 3"]
-    """Color composited onto the background."""
+    foreground: Float[Tensor, "R 3"]
+    """Color without background."""
     opacity: Float[Tensor, "R"]
     """Accumulated opacity in [0, 1]."""
     distance: Float[Tensor, "R"]
     """Depth times opacity, world units."""
+    backgrounds: Float[Tensor, "R 3"] | None = None
+    """Color behind each ray; None: black."""
     weights: Float[Tensor, "N"] | None = None
     """Rendering weights with gradient; None if no loss needs them."""
     view_residual: Float[Tensor, "N 3"] | None = None
     """See `FieldOutput`."""
 
     @property
+    def rgb(self) -> Float[Tensor, "R 3"]:
+        """Color composited onto the background."""
+        if self.backgrounds is None:
+            return self.foreground
+        return torch.addcmul(self.foreground, (1 - self.opacity)[:, None], self.backgrounds)
+
+    @property
     def depth(self) -> Float[Tensor, "R"]:
         """Depth along the ray, world units: the mean, for unbounded scenes the median; 0 where opacity is 0."""
         return self.distance / self.opacity.clamp_min(1e-6)
-
-
-def composite_over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
-    """Composites photo pixels with straight alpha (C = 4) onto backgrounds; returns RGB in [0, 1]."""
-    colors = (pixels / 255).to(backgrounds.dtype)
-    if colors.shape[1] == 3:
-        return colors
-    return torch.lerp(backgrounds, colors[:, :3], colors[:, 3:])
 
 
 def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], samples: Samples) -> Float[Tensor, "R"]:
@@ -122,12 +128,12 @@ class VolumeRenderer(torch.nn.Module):
         if self.unbounded and not has_gradient:
             # Median for unbounded scenes: 1 % of stray weight at the far plane would dominate the mean.
             distance = opacity * median_depth(density, opacity, samples)
-        color = torch.addcmul(foreground, (1 - opacity)[:, None], backgrounds)
         has_losses = self.distortion_loss_weight or self.near_loss_weight or self.view_loss_weight
         if not (self.training and has_gradient and (has_losses or samples.proposals is not None)):
-            return RenderOutput(color, opacity, distance)  # a full view has too many samples to keep
-        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-        return RenderOutput(color, opacity, distance, weights, view_residual)
+            return RenderOutput(foreground, opacity, distance, backgrounds)  # a full view has too many samples to keep
+        per_ray = None if samples.proposals is None else samples.proposals.edges.shape[1] - 1
+        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets, per_ray)
+        return RenderOutput(foreground, opacity, distance, backgrounds, weights, view_residual)
 
     def losses(
         self, output: RenderOutput, samples: Samples, progress: float, texturelessness: Float[Tensor, "R"] | None = None
@@ -140,15 +146,9 @@ class VolumeRenderer(torch.nn.Module):
             progress: training progress in [0, 1].
             texturelessness: texturelessness of each ray's pixel, for `view_loss`.
         """
-        losses: dict[str, Tensor] = {}
         if output.weights is None:
-            return losses
-        if self.distortion_loss_weight:
-            distortion = distortion_loss(output.weights, samples, self.half_size)
-            losses["distortion"] = self.distortion_loss_weight * distortion
-        if near_weight := self.near_loss_weight * max(0.0, 1 - progress / NEAR_LOSS_END):
-            losses["near"] = near_weight * near_loss(output.weights, samples, self.half_size)
-        if self.view_loss_weight and output.view_residual is not None:
-            penalty = view_loss(output.weights, output.view_residual, samples, texturelessness)
-            losses["view"] = self.view_loss_weight * penalty
-        return losses
+            return {}
+        near_weight = self.near_loss_weight * max(0.0, 1 - progress / NEAR_LOSS_END)
+        factors = self.distortion_loss_weight, near_weight, self.view_loss_weight
+        inputs = output.weights, output.view_residual, samples.packed, self.half_size
+        return weight_losses(*inputs, factors, texturelessness)

@@ -1,6 +1,7 @@
 """Empty-space skipping: ray marching through the occupied cells of a coarse grid (Instant-NGP, appendix C)."""
 
 import math
+from collections.abc import Hashable
 from typing import Annotated, Any
 
 import torch
@@ -33,6 +34,7 @@ class SampleCapacity:
     """
 
     HEADROOM = 1.25  # relative to the last count
+    MULTIPLE = 64  # of sizes: kernels are compiled for the alignment of their tensors
 
     def __init__(self) -> None:
         self.per_ray: dict[bool, tuple[float, float]] = {}
@@ -44,7 +46,8 @@ class SampleCapacity:
         """Capacities for marched and for kept steps; None to count exactly."""
         if is_full_pass not in self.per_ray:
             return None, None
-        steps, kept = (math.ceil(self.HEADROOM * count * num_rays) for count in self.per_ray[is_full_pass])
+        counts = (self.HEADROOM * count * num_rays / self.MULTIPLE for count in self.per_ray[is_full_pass])
+        steps, kept = (self.MULTIPLE * math.ceil(count) for count in counts)
         return steps, kept
 
     def record_counts(
@@ -130,6 +133,15 @@ class OccupancySampler(Sampler):
         return None if counts is None else counts[1]
 
     @property
+    def graph_key(self) -> Hashable:
+        if self.full_pass or False not in self.capacity.per_ray or self.min_depth is None:
+            return None
+        return self.updates, self.grid.active.data_ptr(), self.min_depth.data_ptr()
+
+    def read_counts(self) -> None:
+        self.capacity.read_counts()
+
+    @property
     def samples(self) -> int:
         """Steps along the diagonal in training."""
         return self.requested_samples or TRAIN_STEPS_PER_CELL * self.grid.resolution
@@ -158,36 +170,30 @@ class OccupancySampler(Sampler):
         self.capacity, self.min_depth = SampleCapacity(), None
 
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
-        near, far = self.bounds.near_far(rays)
         if generator is None:
             samples, eps = self.eval_samples, max(self.early_stop_eps, INVISIBLE_DEPTH)
-            shift, cells = torch.zeros_like(near), self.grid.occupied
-            depths, packed = self._march(rays, density, near, far, shift, cells, samples, eps)
+            shift, cells = torch.zeros_like(rays.origins[:, 0]), self.grid.occupied
+            depths, packed = self._march(rays, density, shift, cells, samples, eps)
             # Evaluation must not depend on ray chunks: only training drops steps relative to the mean.
-            depths, packed = filter_visible(depths, packed, eps, INVISIBLE_DEPTH, max_dropped=INVISIBLE_DEPTH)
+            depths, packed, _ = filter_visible(depths, packed, eps, INVISIBLE_DEPTH, max_dropped=INVISIBLE_DEPTH)
             return Samples(*packed, optical_depth=depths)
-        shift = torch.rand(near.shape, generator=generator, device=near.device)
+        shift = torch.rand(len(rays), generator=generator, device=rays.origins.device)
         cells = self.grid.occupied if self.full_pass else self.grid.active
         (capacity, kept_capacity), eps = self.capacity.sizes(len(rays), self.full_pass), self.early_stop_eps
-        depths, packed = self._march(rays, density, near, far, shift, cells, self.samples, eps, capacity)
+        depths, packed = self._march(rays, density, shift, cells, self.samples, eps, capacity)
         if self.min_depth is None:
             self.min_depth = self.grid.mean_active_depth().mul(0.5).clamp_max(-math.log1p(-self.alpha_thre))
-        _, kept = filter_visible(depths, packed, eps, self.min_depth, kept_capacity)
+        _, kept, complete = filter_visible(depths, packed, eps, self.min_depth, kept_capacity)
         positions = Samples(*kept).positions(rays)
         self.grid.mark_visible(positions, self.updates)
         self.capacity.record_counts(self.full_pass, packed[3], kept[3])
-        if capacity is not None and kept_capacity is not None:
-            complete = (packed[3][1:] <= capacity) & (kept[3][1:] <= kept_capacity)
-            return Samples(*kept, complete, positions)
-        return Samples(*kept, cached_positions=positions)
+        return Samples(*kept, complete, positions)
 
     @torch.no_grad()
     def _march(
         self,
         rays: Rays,
         density: DensityFn,
-        near: Float[Tensor, "R"],
-        far: Float[Tensor, "R"],
         shift: Float[Tensor, "R"],
         cells: Bool[Tensor, "cells"],
         samples: int,
@@ -199,7 +205,7 @@ class OccupancySampler(Sampler):
         def optical_depth(packed: Packed) -> Float[Tensor, "N"]:
             return self._query(density, Samples(*packed).positions(rays)) * packed[1]
 
-        arguments = rays, self.bounds, near, far, shift, cells, samples, self.step_size(samples)
+        arguments = rays, self.bounds, shift, cells, samples, self.step_size(samples)
         return march_until_opaque(*arguments, optical_depth, early_stop_eps, capacity, MARCH_CHUNKS * self.chunk)
 
     def _query(self, density: DensityFn, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
@@ -223,7 +229,7 @@ class OccupancySampler(Sampler):
         self.full_pass = not phase
         if phase:
             return
-        self.capacity.read_counts()
+        self.read_counts()
 
         def optical_depth(positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
             return self._query(density, positions) * self.step_size(self.samples)

@@ -1,6 +1,5 @@
 """Field growth during training: coarse grids find the shape sooner, fine ones hold the detail."""
 
-import copy
 from typing import TYPE_CHECKING
 
 import lightning as L
@@ -8,8 +7,6 @@ import torch
 from lightning.pytorch.strategies import DDPStrategy
 
 from nerf_lightning.dataset import RayBatch, RayDataModule
-from nerf_lightning.system.system import sum_losses
-from nerf_lightning.utils.seeding import Stream, step_generator
 
 if TYPE_CHECKING:
     from nerf_lightning.system.nerf3d import NeRF3D
@@ -57,17 +54,3 @@ class FieldGrowth(L.Callback):
         if isinstance(trainer.strategy, DDPStrategy):  # its gradient buckets have the old size
             trainer.strategy.model = pl_module
             trainer.strategy.configure_ddp()
-        if pl_module.compile_backend is not None:
-            warm_up_compile(pl_module, batch)
-
-
-def warm_up_compile(system: "NeRF3D", batch: RayBatch) -> None:
-    """Runs a step on a copy with the clock paused: compiling for a new size does not count as training."""
-    field, sampler = copy.deepcopy(system.field), copy.deepcopy(system.sampler)
-    training = system.make_optimizer, system.schedule, system.seed
-    options = *training, system.chunk, system.corrections, system.compile_backend
-    shadow = type(system)(field, sampler, system.renderer, *options)
-    with system.state.clock.pause(), system.trainer.precision_plugin.train_step_context():
-        generator = step_generator(system.seed, Stream.STEP, system.global_step, system.device)
-        losses, _ = shadow.compute_losses(batch, generator)
-        sum_losses(losses).backward()

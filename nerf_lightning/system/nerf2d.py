@@ -8,7 +8,6 @@ from nerf_lightning.dataset import PictureBatch, PixelBatch
 from nerf_lightning.model import PictureField
 from nerf_lightning.system.metrics import psnr
 from nerf_lightning.system.system import StepStats, System
-from nerf_lightning.system.torch_compile import maybe_compile
 
 PIXELS_PER_CHUNK_SAMPLE = 2
 """Pixels rendered at once per sample of `chunk`."""
@@ -26,7 +25,7 @@ class NeRF2D(System):
 
     def loss(self, batch: PixelBatch) -> Float[Tensor, ""]:
         """Mean squared error of the batch."""
-        rgb = maybe_compile(self.field.forward, self.compile_backend)(batch.uv)
+        rgb = self.field(batch.uv)
         return torch.nn.functional.mse_loss(rgb, batch.rgb)
 
     def training_step(self, batch: PixelBatch, batch_idx: int) -> Tensor:

@@ -11,20 +11,21 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
+from nerf_lightning.dataset.ray_datamodule import STEPS_PER_DRAW
+from nerf_lightning.kernels import mean_squared_error, photometric_loss
+from nerf_lightning.kernels.backend import get_kernels
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import RenderOutput, VolumeRenderer, composite_over
-from nerf_lightning.renderer.background import random_color_error
+from nerf_lightning.renderer.background import opacity_loss
 from nerf_lightning.sampler import CHUNK, Sampler, Samples, split_by_rays
 from nerf_lightning.system.correction_trial import CorrectionTrials
 from nerf_lightning.system.growth import FieldGrowth, sync_resolution_scale
 from nerf_lightning.system.state import TrainingState
+from nerf_lightning.system.step_graph import StepGraph, list_addresses
 from nerf_lightning.system.system import OptimizerFactory, Schedule, StepStats, System, sum_losses
-from nerf_lightning.system.torch_compile import maybe_compile
 from nerf_lightning.utils.seeding import Stream, step_generator
 
-ADAPT_EVERY = 16
-"""Steps between adaptations of the number of rays on several devices, each of which has to wait for the others' counts."""
 SAMPLE_CHUNKS_PER_PASS = 16
 """Samples drawn at once without gradient, in multiples of `chunk`."""
 
@@ -37,7 +38,7 @@ class NeRF3D(System):
         sampler: rays -> samples.
         renderer: samples -> pixels.
         corrections: refinement of training cameras and exposure, learned with the field; None keeps them as given.
-        optimizer, schedule, seed, chunk, compile_backend, state: see `System`.
+        optimizer, schedule, seed, chunk, state: see `System`.
     """
 
     field: Field
@@ -52,13 +53,13 @@ class NeRF3D(System):
         seed: int = 0,
         chunk: int = CHUNK,
         corrections: Corrections | None = None,
-        compile_backend: str | None = None,
         state: TrainingState | None = None,
     ):
-        super().__init__(field, optimizer, schedule, seed, chunk, compile_backend, state)
+        super().__init__(field, optimizer, schedule, seed, chunk, state)
         self.sampler = sampler
         self.renderer = renderer
         self.corrections = corrections
+        self.step_graph: StepGraph | None = None
 
     def param_groups(self) -> list[dict[str, Any]]:
         groups = [*self.sampler.param_groups(), *(self.corrections.param_groups() if self.corrections else [])]
@@ -107,14 +108,43 @@ class NeRF3D(System):
         if self.corrections is not None:
             self.corrections.load_trial_state(checkpoint["corrections"])
 
-    def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor:
-        step = self.global_step
+    def training_step(self, batch: RayBatch, batch_idx: int) -> Tensor | None:
+        """Computes the loss; None if the step's graph has already done the whole step."""
+        step, loss = self.global_step, None
         generator = step_generator(self.seed, Stream.STEP, step, self.device)
-        self.sampler.update(step, maybe_compile(self.field.density, self.compile_backend), generator)
-        losses, self.stats = self.compute_losses(batch, generator)
+        self.sampler.update(step, self.field.density, generator)
+        stats = self._replay_step(batch, generator.initial_seed()) if self.is_graphable else None
+        if stats is None:
+            losses, stats = self.compute_losses(batch, generator)
+            loss = sum_losses(losses)
+        self.stats = stats
         self.update_error_map()
         self.adapt_num_rays()
-        return sum_losses(losses)
+        return loss
+
+    @property
+    def is_graphable(self) -> bool:
+        """Whether steps may run as CUDA graphs: on one NVIDIA GPU, in single precision, without enabled corrections."""
+        is_plain = self.device.type == "cuda" and get_kernels() == "auto" and not self.is_corrected
+        trainer = self._trainer  # None in steps without one
+        return is_plain and trainer is not None and trainer.precision == "32-true" and trainer.world_size == 1
+
+    def _replay_step(self, batch: RayBatch, seed: int) -> StepStats | None:
+        """Runs the step as a CUDA graph; None if it has to run by itself."""
+        optimizer = self.trainer.optimizers[0]
+        optimizer.zero_grad()  # those of the last step, which Lightning would apply again
+        sampler_key = self.sampler.graph_key
+        # Numbers that follow progress are constant between draws.
+        key = None if sampler_key is None else (self.global_step // STEPS_PER_DRAW, len(batch.rays), sampler_key)
+        self.step_graph = self.step_graph or StepGraph(self.device, self._run_step, self.compute_losses)
+        return self.step_graph.run(key, list_addresses(self, optimizer), batch, seed)
+
+    def _run_step(self, batch: RayBatch, generator: torch.Generator) -> StepStats:
+        losses, stats = self.compute_losses(batch, generator)
+        sum_losses(losses).backward()
+        self.trainer.optimizers[0].step()
+        self.trainer.optimizers[0].zero_grad()
+        return stats
 
     def compute_losses(self, batch: RayBatch, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
         """Losses of a step by name, and its statistics. All randomness comes from `generator`."""
@@ -123,22 +153,21 @@ class NeRF3D(System):
             assert batch.views is not None  # training batches have views
             rays = self.corrections.poses(rays, batch.views)
         with torch.no_grad():
-            samples = self.sampler(rays.detach(), maybe_compile(self.field.density, self.compile_backend), generator)
+            samples = self.sampler(rays.detach(), self.field.density, generator)
         backgrounds = self.renderer.background.expand(len(rays), is_training=True)
-        output = maybe_compile(self.renderer.forward, self.compile_backend)(rays, samples, self.field, backgrounds)
-        truth, rgb = composite_over(batch.pixels, backgrounds), output.rgb
-        if self.corrections is not None:
+        output = self.renderer(rays, samples, self.field, backgrounds)
+        weights = batch.weights, samples.complete
+        if self.corrections is None:
+            pixels = backgrounds, batch.pixels
+            loss, squared_errors = photometric_loss(output.foreground, output.opacity, *pixels, *weights)
+        else:
             assert batch.views is not None
-            rgb = self.corrections.color(rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
-        squared_errors = (rgb - truth).square().mean(1)
+            truth = composite_over(batch.pixels, backgrounds)
+            rgb = self.corrections.color(output.rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
+            loss, squared_errors = mean_squared_error(rgb, truth, *weights)
+        losses = {"photometric": loss, **self.regularize(output, samples, batch)}
         if self.renderer.background.is_random:
-            squared_errors = random_color_error(squared_errors, output.opacity, batch.pixels[:, 3] / 255)
-        if samples.complete is not None:  # truncated rays must not contribute
-            squared_errors = torch.where(samples.complete, squared_errors, 0.0)
-        losses = {
-            "photometric": (squared_errors if batch.weights is None else squared_errors * batch.weights).mean(),
-            **self.regularize(output, samples, batch),
-        }
+            losses["opacity"] = opacity_loss(output.opacity, batch.pixels, *weights)
         per_ray = self.sampler.samples_per_ray
         stats = StepStats(
             losses["photometric"].detach(),
@@ -160,13 +189,16 @@ class NeRF3D(System):
         }
 
     def adapt_num_rays(self) -> None:
-        """Adapts the number of rays per step to the samples that the last step drew."""
-        drawn = self.stats.samples
+        """Adapts the number of rays per step to the samples that the last step drew; on accelerators before a new draw."""
+        steps = 1 if self.device.type == "cpu" else STEPS_PER_DRAW
+        if (self.global_step + 1) % steps:
+            return
+        self.sampler.read_counts()
+        per_ray = self.sampler.samples_per_ray
+        drawn = self.stats.samples if per_ray is None else round(per_ray * self.stats.rays)
         if self.trainer.world_size > 1:  # all processes draw from one stream, so they must adapt in the same way
-            if self.stats.complete_rays is not None and self.global_step % ADAPT_EVERY:
-                return
             drawn = int(self.trainer.strategy.reduce(torch.tensor(drawn, device=self.device), reduce_op="sum"))
-        self.datamodule.adapt_num_rays(drawn)
+        self.datamodule.adapt_num_rays(drawn, steps)
 
     def update_error_map(self) -> None:
         """Updates the data's error map with the last step's squared errors."""
@@ -216,8 +248,9 @@ class NeRF3D(System):
                 samples = samples.clip(near, far)
             for span, part in split_by_rays(samples.merge_low_weight_samples(), self.chunk):
                 outputs.append(self.renderer(chunk[span], part, self.field, color.expand(len(chunk[span]), 3)))
-        names = ("rgb", "opacity", "distance")
-        return RenderOutput(*(torch.cat([getattr(output, name) for output in outputs]) for name in names))
+        names = ("foreground", "opacity", "distance")
+        foreground, opacity, distance = (torch.cat([getattr(output, name) for output in outputs]) for name in names)
+        return RenderOutput(foreground, opacity, distance, color.expand(len(rays), 3))
 
     @property
     def background(self) -> list[float]:

@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -46,6 +46,11 @@ class StepStats:
     """Rays that have all their samples; None for all."""
     losses: Mapping[str, Tensor] = field(default_factory=dict)
     """Terms of the loss by name, on the device."""
+
+    def clone(self) -> "StepStats":
+        """A copy of what is read only after further steps."""
+        errors, complete = (None if x is None else x.clone() for x in (self.squared_errors, self.complete_rays))
+        return replace(self, mse=self.mse.clone(), squared_errors=errors, complete_rays=complete)
 
 
 @dataclass(frozen=True)
@@ -99,7 +104,6 @@ class System(L.LightningModule):
         schedule: factor on the learning rate by progress and step.
         seed: of all randomness in training steps.
         chunk: samples rendered at once without gradient; bounds the memory of a view.
-        compile_backend: torch.compile backend of training steps, see `torch_compile.maybe_compile`; None does not compile.
         state: training state shared with callbacks; None makes one.
     """
 
@@ -110,7 +114,6 @@ class System(L.LightningModule):
         schedule: Schedule,
         seed: int = 0,
         chunk: int = CHUNK,
-        compile_backend: str | None = None,
         state: TrainingState | None = None,
     ):
         super().__init__()
@@ -119,11 +122,15 @@ class System(L.LightningModule):
         self.schedule = schedule
         self.seed = seed
         self.chunk = chunk
-        self.compile_backend = compile_backend
         self.state = state or TrainingState()
         self.corrections: Corrections | None = None
         """Refinement of training cameras and exposure."""
         self.stats = StepStats(torch.tensor(math.nan), 0, 0)
+
+    @property
+    def is_graphable(self) -> bool:
+        """Whether steps may run as CUDA graphs."""
+        return False
 
     def warm_start_from(self, source: "System") -> None:
         """Initializes from a trained system whose field is a smaller one of the same kind."""
@@ -166,7 +173,15 @@ class System(L.LightningModule):
     def set_learning_rates(self, optimizer: torch.optim.Optimizer, step: int) -> None:
         factors = self.lr_factors(self.state.progress, step)
         for group in optimizer.param_groups:
-            group["lr"] = group["initial_lr"] * factors[group["name"]] * self.state.lr_scale
+            lr = group["initial_lr"] * factors[group["name"]] * self.state.lr_scale
+            if "capturable" in group:
+                group["capturable"] = self.is_graphable
+            if not group.get("capturable"):
+                group["lr"] = lr
+            elif isinstance(group["lr"], Tensor) and group["lr"].device.type == self.device.type:
+                group["lr"].fill_(lr)
+            else:
+                group["lr"] = torch.tensor(lr, device=self.device)  # a CUDA graph reads it
 
     def on_train_batch_start(self, batch: Any, batch_idx: int) -> None:
         if self.trainer.max_steps > 0:

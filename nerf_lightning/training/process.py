@@ -18,15 +18,15 @@ from nerf_lightning.utils.memory import keep_freed_memory
 from nerf_lightning.utils.progress import is_interactive
 
 
-def prepare_process(cfg: DictConfig, may_compile: bool = False) -> None:
-    """Sets process-wide state; with `may_compile`, reference kernels if the run compiles its steps.
+def prepare_process(cfg: DictConfig) -> None:
+    """Sets process-wide state.
 
     Raises:
         InputError: for unknown kernels.
     """
     if cfg.threads is not None:
         torch.set_num_threads(cfg.threads)
-    set_kernels("reference" if may_compile and cfg.compile else cfg.kernels)
+    set_kernels(cfg.kernels)
     keep_freed_memory()
     torch.set_flush_denormal(True)  # tiny weights otherwise slow the CPU down many times
     L.seed_everything(cfg.seed, verbose=False)
@@ -49,10 +49,9 @@ def check_processes(trainer: L.Trainer) -> None:
 def warm_up(system: System, data: DataModule, device: torch.device) -> None:
     """Runs a small step on a copy, so that kernels are compiled before the clock starts.
 
-    CPU and GPU kernels are compiled once and cached; with `compile`, in every process.
+    CPU and GPU kernels are compiled once and cached.
     """
-    is_compiled = device.type in ("cpu", "cuda") or system.compile_backend is not None
-    note = " (compiled on first use: half a minute)" if is_compiled else ""
+    note = " (compiled on first use: half a minute)" if device.type in ("cpu", "cuda") else ""
     console = Console()
     with console.status(f"preparing kernels{note}") if is_interactive(console) else nullcontext():
         copy.deepcopy(system).to(device).warm_up_kernels(data.make_warmup_batch())

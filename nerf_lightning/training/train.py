@@ -26,7 +26,6 @@ from nerf_lightning.runs.folder import save_config
 from nerf_lightning.runs.run_lock import delete_run_outputs
 from nerf_lightning.runs.scene_file import save_scene
 from nerf_lightning.system import System
-from nerf_lightning.system.torch_compile import COMPILE_BACKEND, check_compiler
 from nerf_lightning.training.loggers import finish_wandb, log_summary
 from nerf_lightning.training.process import check_processes, prepare_process, warm_up
 from nerf_lightning.training.report import report_photos, report_results
@@ -87,9 +86,7 @@ def prepare(cfg: DictConfig) -> torch.device:
     """Sets up the process and checks the options of all groups. Returns the device."""
     device = build.resolve_run_device(cfg)
     silence_lightning()
-    prepare_process(cfg, may_compile=True)
-    if cfg.compile:
-        check_compiler(device, COMPILE_BACKEND)
+    prepare_process(cfg)
     build.check_groups(cfg)
     return device
 

@@ -44,6 +44,8 @@ def silence_lightning() -> None:
         "GPU available but not used",
         "isinstance.treespec",
         "all_gather is dep",
+        "`training_step` returned `None`",
+        "running without CUDA graph capture",
     ):
         warnings.filterwarnings("ignore", f".*{part}.*")
 

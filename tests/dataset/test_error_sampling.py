@@ -30,8 +30,8 @@ def make_trained_sampler(views: Views, errors: Tensor, share: float = 0.5, steps
     """Sampler after steps with a fixed error per pixel."""
     sampler = ErrorSampler(views, share)
     for step in range(steps):
-        pixels, _ = sampler.draw(4000, make_generator(step))
-        sampler.update(errors[pixels])
+        pixels, _, tiles = sampler.draw(4000, make_generator(step))
+        sampler.update(tiles, errors[pixels])
     return sampler
 
 
@@ -42,7 +42,7 @@ def test_error_sampler_weights_make_the_draw_unbiased(masked: bool):
     errors = torch.rand(len(known), generator=make_generator()) ** 4
     errors[:200] *= 0.01
     sampler = make_trained_sampler(views, errors)
-    pixels, weights = sampler.draw(400_000, make_generator(100))
+    pixels, weights, _ = sampler.draw(400_000, make_generator(100))
     assert (weights[~views.mask[pixels]] == 0).all() and (weights[views.mask[pixels]] > 0).all()
     share = torch.zeros(len(known), dtype=torch.float64).index_add_(0, pixels, weights.double()) / len(pixels)
     torch.testing.assert_close(share.sum(), torch.tensor(1.0, dtype=torch.float64), rtol=0.01, atol=0)
@@ -61,10 +61,10 @@ def test_error_sampler_draws_tiles_of_large_error():
     views = make_views()
     errors = torch.zeros(len(views.pixels))
     errors[800:1056] = 0.5  # the second photo, which is one tile
-    pixels, _ = make_trained_sampler(views, errors).draw(20_000, make_generator(100))
+    pixels, _, _ = make_trained_sampler(views, errors).draw(20_000, make_generator(100))
     inside = ((pixels >= 800) & (pixels < 1056)).float().mean()
     assert inside == pytest.approx(0.5 + 0.5 * 256 / len(errors), abs=0.02)
-    pixels, weights = make_trained_sampler(views, 0 * errors).draw(20_000, make_generator(100))
+    pixels, weights, _ = make_trained_sampler(views, 0 * errors).draw(20_000, make_generator(100))
     assert ((pixels >= 800) & (pixels < 1056)).float().mean() == pytest.approx(256 / len(errors), abs=0.02)
     torch.testing.assert_close(weights, torch.ones_like(weights), rtol=1e-5, atol=0)
 
@@ -75,12 +75,11 @@ def test_error_sampler_state_resumes_exactly():
     whole, other = make_trained_sampler(views, errors, steps=UPDATE_EVERY + 5), ErrorSampler(views, 0.5)
     other.load_state_dict(whole.state_dict())
     for step in range(UPDATE_EVERY):
-        pixels, weights = whole.draw(300, make_generator(step))
-        assert all(map(torch.equal, other.draw(300, make_generator(step)), (pixels, weights)))
-        whole.update(errors[pixels])
+        pixels, weights, tiles = whole.draw(300, make_generator(step))
+        assert all(map(torch.equal, other.draw(300, make_generator(step)), (pixels, weights, tiles)))
+        whole.update(tiles, errors[pixels])
         order = torch.randperm(300)  # sums do not depend on it
-        other.last_tiles = other.last_tiles[order]
-        other.update(errors[pixels][order])
+        other.update(tiles[order], errors[pixels][order])
     assert all(map(torch.equal, whole.state_dict().values(), other.state_dict().values()))
 
 

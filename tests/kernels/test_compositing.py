@@ -169,7 +169,7 @@ def test_filter_visible_any_threshold_matches_loop_over_samples(
             i += 1
         ends.append(len(kept))
     given = density * samples.dt, packed(samples), early_stop_eps, min_optical_depth
-    optical_depth, (t, dt, ray, offsets) = filter_visible(*given, max_dropped=max_dropped)
+    optical_depth, (t, dt, ray, offsets), _ = filter_visible(*given, max_dropped=max_dropped)
     assert torch.equal(optical_depth, given[0][kept])
     assert torch.equal(t, samples.t[kept]) and torch.equal(dt, samples.dt[kept])
     assert torch.equal(ray, samples.ray[kept]) and offsets.tolist() == ends
@@ -179,5 +179,5 @@ def test_filter_visible_nan_density_stays(kernels: str):
     samples = make_ragged_samples([3, 5, 2])
     density = torch.zeros(10)
     density[5] = float("nan")
-    _, (t, _, ray, _) = filter_visible(density * samples.dt, packed(samples), 1e-4, 0.01)
+    _, (t, _, ray, _), _ = filter_visible(density * samples.dt, packed(samples), 1e-4, 0.01)
     assert float(samples.t[5]) in t.tolist() and (ray == 1).any()

@@ -68,7 +68,7 @@ def filter_visible(draw: DRAW) -> Case:
     least, max_dropped = draw(st.sampled_from([(0.0, math.inf), (0.1, math.inf), (0.1, 0.2)]))
 
     def call() -> list[Tensor]:
-        kept, which = k.filter_visible(optical_depth, given, 1e-3, least, max_dropped=max_dropped)
+        kept, which, _ = k.filter_visible(optical_depth, given, 1e-3, least, max_dropped=max_dropped)
         return [kept, *which]
 
     return Case(call, [], rtol=0, atol=0)
@@ -167,8 +167,7 @@ def march(draw: DRAW) -> Case:
     occupied = torch.rand(draw(st.sampled_from([1, 6, 24])) ** 3) < draw(st.sampled_from([0.0, 0.03, 0.5, 1.0]))
     samples, step = draw(st.sampled_from([1, 30, 100])), draw(st.sampled_from([1e-3, 0.05, 10.0]))
     shift = torch.rand(71) if draw(st.booleans()) else torch.zeros(71)
-    ends = bounds.near_far(rays)
-    return Case(lambda: k.march(rays, bounds, *ends, shift, occupied, samples, unit * step), [], rtol=0, atol=0)
+    return Case(lambda: k.march(rays, bounds, shift, occupied, samples, unit * step), [], rtol=0, atol=0)
 
 
 def proposals(draw: DRAW) -> Case:

@@ -31,7 +31,7 @@ def test_march_matches_loop_over_rays_and_steps(training: bool, resolution: int,
     step = float((box.aabb[1] - box.aabb[0]).norm()) / 40
     near, far = box.near_far(rays)
     shift = torch.rand(len(rays)) if training else torch.zeros(len(rays))
-    actual = Samples(*march(rays, box, near, far, shift, occupied, 40, step))
+    actual = Samples(*march(rays, box, shift, occupied, 40, step))
     total = 0
     for r in range(len(rays)):
         expected = []
@@ -67,7 +67,7 @@ def test_march_along_walls_matches_reference(distance: float):
         for version in ("reference", "auto"):
             set_kernels(version)
             step = 2 * 3**0.5 / 4000
-            found = march(rays, CUBE, *CUBE.near_far(rays), torch.zeros(500), grid.flatten(), 4000, step)
+            found = march(rays, CUBE, torch.zeros(500), grid.flatten(), 4000, step)
             results.append(Samples(*found))
         assert torch.equal(results[0].t, results[1].t) and torch.equal(results[0].offsets, results[1].offsets)
         total += len(results[0])
@@ -109,9 +109,8 @@ def march_shells(rays: Rays, occupied: Tensor) -> tuple[Tensor, Packed, int]:
         t, dt, ray, _ = packed
         return shells(rays.origins.detach()[ray] + t[:, None] * rays.directions[ray]) * dt
 
-    near, far = CUBE.near_far(rays)
-    shift = torch.rand(near.shape, generator=torch.Generator().manual_seed(3))
-    depths, packed = march_until_opaque(rays, CUBE, near, far, shift, occupied, 100, STEP, optical_depth, EPS)
+    shift = torch.rand(len(rays), generator=torch.Generator().manual_seed(3))
+    depths, packed = march_until_opaque(rays, CUBE, shift, occupied, 100, STEP, optical_depth, EPS)
     return depths, packed, sum(queries)
 
 
@@ -126,8 +125,8 @@ def test_march_until_opaque_any_occupancy_finds_visible_samples(occupied_fractio
     set_kernels("auto")
     depths, packed, queries = march_shells(rays, occupied)
     for min_optical_depth in (0.0, 0.05):
-        kept, intervals = filter_visible(depths, packed, EPS, min_optical_depth)
-        expected_kept, others = filter_visible(expected, every, EPS, min_optical_depth)
+        kept, intervals, _ = filter_visible(depths, packed, EPS, min_optical_depth)
+        expected_kept, others, _ = filter_visible(expected, every, EPS, min_optical_depth)
         assert all(torch.equal(a, b) for a, b in zip((kept, *intervals), (expected_kept, *others), strict=True))
     assert queries == len(depths) and (len(depths) < 0.7 * most or occupied_fraction < 1)
     again = run_with_threads(lambda: march_shells(rays, occupied), 2 if torch.get_num_threads() == 1 else 1)

@@ -1,15 +1,18 @@
 """Small multilayer perceptrons with one or two hidden layers: all layers in one kernel, forward and backward.
 
-Matrices are read padded to powers of two. Products round their factors to TF32 and add in float32.
+Matrices are read padded to powers of two. Products round their factors to TF32 and add in float32. The first outputs, the head,
+may have an activation.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
+from nerf_lightning.kernels.activation import truncated_exp
 from nerf_lightning.kernels.gpu.launch import kernel
 
 BLOCK = 64
@@ -18,6 +21,8 @@ MIN_WIDTH, MAX_WIDTH = 16, 64
 """Widths of a layer: the least that tensor cores multiply, the largest whose gradient does not spill registers."""
 MIN_CAPABILITY = (8, 0)
 """Compute capability of the first GPUs with TF32."""
+ACTIVATIONS: dict[Any, str] = {None: "none", truncated_exp: "exp", torch.sigmoid: "sigmoid"}
+"""Names of the activations that the kernels compute."""
 
 
 @triton.jit
@@ -35,6 +40,14 @@ def store_block(x, block, i, is_input, width, C: tl.constexpr):
 
 
 @triton.jit
+def point_at_rest(rest, i, is_input, heads, outputs, C: tl.constexpr):
+    """Pointers to rows `i` of the outputs behind the head, at their columns among all outputs; and which of them exist."""
+    column = tl.arange(0, C)[None, :]
+    is_rest = is_input[:, None] & (column >= heads) & (column < outputs)
+    return rest + i[:, None] * (outputs - heads) + column - heads, is_rest
+
+
+@triton.jit
 def load_transposed(weight, first, inputs, width, outputs, IN: tl.constexpr, OUT: tl.constexpr):
     """Columns first : first + inputs of a matrix [outputs, width], transposed and padded to [IN, OUT]."""
     i, o = tl.arange(0, IN)[:, None], tl.arange(0, OUT)[None, :]
@@ -48,20 +61,33 @@ def load_bias(bias, outputs, OUT: tl.constexpr):
 
 
 @triton.jit
+def exponentiate(x, scale):
+    """`truncated_exp` divided by a scale."""
+    return tl.exp(tl.minimum(x, 15.0, tl.PropagateNan.ALL)) / scale
+
+
+@triton.jit
+def exp_slope(value, scale):
+    """Derivative of `exponentiate` where it has this value."""
+    return tl.maximum(value, tl.exp(tl.zeros_like(value) - 15.0) / scale, tl.PropagateNan.ALL)
+
+
+@triton.jit
 def relu(h):
     return tl.maximum(h, 0.0, propagate_nan=tl.PropagateNan.ALL)
 
 
 @triton.jit
 def compute_hidden(
-    x, extra, w1, b1, w2, b2, inputs, extras, hidden, TWO: tl.constexpr, IN: tl.constexpr, EX: tl.constexpr,
-    HID: tl.constexpr,
+    x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO: tl.constexpr, IN: tl.constexpr,
+    EX: tl.constexpr, HID: tl.constexpr,
 ):  # fmt: skip
     """Hidden layers [B, HID]; with one, it stands for both."""
-    width = inputs + extras
-    first = tl.dot(x, load_transposed(w1, 0, inputs, width, hidden, IN, HID), input_precision="tf32")
+    width, block = inputs + extras, load_block(x, i, is_input, inputs, IN)
+    first = tl.dot(block, load_transposed(w1, 0, inputs, width, hidden, IN, HID), input_precision="tf32")
     if EX > 0:
-        first += tl.dot(extra, load_transposed(w1, inputs, extras, width, hidden, EX, HID), input_precision="tf32")
+        columns = load_transposed(w1, inputs, extras, width, hidden, EX, HID)
+        first += tl.dot(load_block(extra, i, is_input, extras, EX), columns, input_precision="tf32")
     first = relu(first + load_bias(b1, hidden, HID))
     second = first
     if TWO:
@@ -70,28 +96,25 @@ def compute_hidden(
     return first, second
 
 
-@triton.jit
-def load_inputs(x, extra, i, is_input, inputs, extras, IN: tl.constexpr, EX: tl.constexpr):
-    """Blocks of both inputs; the first stands for missing extra inputs."""
-    block = load_block(x, i, is_input, inputs, IN)
-    extra_block = block
-    if EX > 0:
-        extra_block = load_block(extra, i, is_input, extras, EX)
-    return block, extra_block
-
-
 @kernel(num_warps=8)
 def propagate(
-    x, extra, w1, b1, w2, b2, w3, b3, out, count, inputs, extras, hidden, outputs,
-    TWO: tl.constexpr, IN: tl.constexpr, EX: tl.constexpr, HID: tl.constexpr, OUT: tl.constexpr, B: tl.constexpr,
+    x, extra, w1, b1, w2, b2, w3, b3, head, rest, count, inputs, extras, hidden, outputs, heads, scale,
+    ACTIVATION: tl.constexpr, TWO: tl.constexpr, IN: tl.constexpr, EX: tl.constexpr, HID: tl.constexpr,
+    OUT: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Outputs of a network with the hidden layers 1 and, if TWO, 2; layer 3 is the last."""
+    """Head and further outputs of a network with the hidden layers 1 and, if TWO, 2; layer 3 is the last."""
     i = tl.program_id(0) * B + tl.arange(0, B)
     is_input = i < count
-    block, extra_block = load_inputs(x, extra, i, is_input, inputs, extras, IN, EX)
-    _, h = compute_hidden(block, extra_block, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID)
+    _, h = compute_hidden(x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID)
     y = tl.dot(h, load_transposed(w3, 0, hidden, hidden, outputs, HID, OUT), input_precision="tf32")
-    store_block(out, y + load_bias(b3, outputs, OUT), i, is_input, outputs, OUT)
+    y += load_bias(b3, outputs, OUT)
+    pointers, is_rest = point_at_rest(rest, i, is_input, heads, outputs, OUT)
+    tl.store(pointers, y, is_rest)
+    if ACTIVATION == "exp":
+        y = exponentiate(y, scale)
+    elif ACTIVATION == "sigmoid":
+        y = 1 / (1 + tl.exp(tl.minimum(-y, 80.0, tl.PropagateNan.ALL)))
+    store_block(head, y, i, is_input, heads, OUT)
 
 
 @triton.jit
@@ -102,16 +125,24 @@ def add_bias_gradient(grad_bias, grad, outputs, OUT: tl.constexpr):
 
 @kernel(num_warps=8)
 def differentiate(
-    x, extra, w1, b1, w2, b2, w3, grad, grad_x, h1, h2, g1, g2, bias_gradients, count, inputs, extras, hidden, outputs,
-    TWO: tl.constexpr, IN: tl.constexpr, EX: tl.constexpr, HID: tl.constexpr, OUT: tl.constexpr, B: tl.constexpr,
+    x, extra, w1, b1, w2, b2, w3, head, grad_head, grad_rest, grad_x, h1, h2, g1, g2, g3, bias_gradients,
+    count, inputs, extras, hidden, outputs, heads, scale,
+    ACTIVATION: tl.constexpr, TWO: tl.constexpr, IN: tl.constexpr, EX: tl.constexpr, HID: tl.constexpr,
+    OUT: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Gradients of inputs and biases, and the factors of the matrices' gradients: inputs h and gradients g of hidden layers."""
+    """Gradients of inputs and biases, and the factors of the matrices' gradients: inputs h and gradients g of layers."""
     i = tl.program_id(0) * B + tl.arange(0, B)
     is_input = i < count
-    block, extra_block = load_inputs(x, extra, i, is_input, inputs, extras, IN, EX)
-    first, second = compute_hidden(block, extra_block, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID)
-    above = load_block(grad, i, is_input, outputs, OUT)
+    first, second = compute_hidden(x, extra, i, is_input, w1, b1, w2, b2, inputs, extras, hidden, TWO, IN, EX, HID)
+    above, value = load_block(grad_head, i, is_input, heads, OUT), load_block(head, i, is_input, heads, OUT)
+    if ACTIVATION == "exp":
+        above *= exp_slope(value, scale)
+    elif ACTIVATION == "sigmoid":
+        above *= value * (1 - value)
+    pointers, is_rest = point_at_rest(grad_rest, i, is_input, heads, outputs, OUT)
+    above += tl.load(pointers, is_rest, 0.0)
     add_bias_gradient(bias_gradients + 2 * hidden, above, outputs, OUT)
+    store_block(g3, above, i, is_input, outputs, OUT)
     store_block(h2, second, i, is_input, hidden, HID)
     last = tl.trans(load_transposed(w3, 0, hidden, hidden, outputs, HID, OUT))
     above = tl.where(second <= 0, 0.0, tl.dot(above, last, input_precision="tf32"))
@@ -146,30 +177,40 @@ class MLP(torch.autograd.Function):
     """`kernels.mlp_heads`; parameters are each layer's matrix and bias."""
 
     @staticmethod
-    def forward(ctx, x: Tensor, extra: Tensor, num_head: int, *parameters: Tensor):
-        x, extra = x.contiguous(), extra.contiguous()
-        parameters = tuple(p.contiguous() for p in parameters)
-        hidden, outputs, is_deep = len(parameters[1]), len(parameters[-1]), len(parameters) == 6
-        ctx.shape = len(x), x.shape[1], extra.shape[1], hidden, outputs
-        names = zip(("IN", "EX", "HID", "OUT"), ctx.shape[1:], strict=True)
-        ctx.constants = {"TWO": is_deep, **{name: pad_width(width) for name, width in names}, "B": BLOCK}
-        out, middle = x.new_empty(len(x), outputs), parameters[2:4] if is_deep else parameters[:2]
-        weights = *parameters[:2], *middle, *parameters[-2:]
-        propagate((triton.cdiv(len(x), BLOCK),), x, extra, *weights, out, *ctx.shape, **ctx.constants)
-        ctx.save_for_backward(x, extra, *weights[:5], parameters[-1])
-        return out[:, :num_head], out[:, num_head:]
+    def forward(
+        ctx, x: Tensor, extra: Tensor, num_head: int, activation: Any, scale: float, *parameters: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        x, extra, *layers = (p.contiguous() for p in (x, extra, *parameters))
+        count, hidden, outputs = len(x), len(layers[1]), len(layers[-1])
+        ctx.shape = count, x.shape[1], extra.shape[1], hidden, outputs, num_head, scale
+        names = zip(("IN", "EX", "HID", "OUT"), ctx.shape[1:5], strict=True)
+        ctx.constants = {"ACTIVATION": ACTIVATIONS[activation], "TWO": len(layers) == 6, "B": BLOCK}
+        ctx.constants |= {name: pad_width(width) for name, width in names}
+        out = x.new_empty(count, num_head), x.new_empty(count, outputs - num_head)
+        # A single hidden layer stands for both.
+        inputs = x, extra, *layers[:2], *layers[-4:]
+        propagate((triton.cdiv(count, BLOCK),), *inputs, *out, *ctx.shape, **ctx.constants)
+        ctx.save_for_backward(x, extra, out[0], *layers)
+        ctx.set_materialize_grads(False)
+        return out
 
     @staticmethod
-    def backward(ctx, *grads: Tensor):
-        x, extra, *weights, last_bias = ctx.saved_tensors
-        grad, (count, inputs, extras, hidden, outputs) = torch.cat(grads, dim=1), ctx.shape
-        grad_x, (h1, h2, g1, g2) = torch.empty_like(x), x.new_empty(4, count, hidden)
+    def backward(ctx, *grads: Tensor | None):
+        x, extra, head, *layers = ctx.saved_tensors
+        count, widths = len(x), (head.shape[1], len(layers[-1]) - head.shape[1])
+        above = [
+            grad.contiguous() if grad is not None else x.new_zeros(count, width) if width else x
+            for grad, width in zip(grads, widths, strict=True)
+        ]
+        _, inputs, extras, hidden, outputs, *_ = ctx.shape
+        grad_x, (h1, h2, g1, g2), g3 = torch.empty_like(x), x.new_empty(4, count, hidden), x.new_empty(count, outputs)
         biases = x.new_zeros(2 * hidden + outputs)
-        buffers = grad, grad_x, h1, h2, g1, g2, biases
-        differentiate((triton.cdiv(count, BLOCK),), x, extra, *weights, *buffers, *ctx.shape, **ctx.constants)
+        given = x, extra, *layers[:2], *layers[-4:-1], head, *above, grad_x, h1, h2, g1, g2, g3, biases
+        differentiate((triton.cdiv(count, BLOCK),), *given, *ctx.shape, **ctx.constants)
         first = x.new_empty(hidden, inputs + extras)
         torch.mm(g1.T, x, out=first[:, :inputs])
         if extras:
             torch.mm(g1.T, extra, out=first[:, inputs:])
         middle = [g2.T @ h1, biases[hidden : 2 * hidden]] if ctx.constants["TWO"] else []
-        return grad_x, None, None, first, biases[:hidden], *middle, grad.T @ h2, biases[2 * hidden :]
+        gradients = first, biases[:hidden], *middle, g3.T @ h2, biases[2 * hidden :]
+        return grad_x, None, None, None, None, *gradients

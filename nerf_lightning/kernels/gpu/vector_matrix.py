@@ -7,6 +7,7 @@ from torch import Tensor
 
 from nerf_lightning.kernels.gpu.hashgrid import locate_cell
 from nerf_lightning.kernels.gpu.launch import kernel
+from nerf_lightning.kernels.gpu.mlp import exp_slope, exponentiate
 
 BLOCK = 32
 """Positions per program."""
@@ -15,13 +16,7 @@ BLOCK = 32
 @triton.jit
 def order_axes(mode: tl.constexpr, x, y, z):
     """First and second axis of a mode's plane, and the axis of its line."""
-    if mode == 0:
-        axes = y, z, x
-    elif mode == 1:
-        axes = x, z, y
-    else:
-        axes = x, y, z
-    return axes
+    return (y, z, x) if mode == 0 else (x, z, y) if mode == 1 else (x, y, z)
 
 
 @triton.jit
@@ -46,9 +41,10 @@ def interpolate(planes, lines, mode: tl.constexpr, x, y, z, side, channels, is_p
 
 @kernel()
 def multiply(
-    planes, lines, unit, out, positions, side, channels, IS_SUM: tl.constexpr, C: tl.constexpr, B: tl.constexpr
-):
-    """Products of planes and lines [N, 3, channels], or their sum [N]."""
+    planes, lines, unit, out, positions, side, channels, scale,
+    IS_SUM: tl.constexpr, IS_EXP: tl.constexpr, C: tl.constexpr, B: tl.constexpr,
+):  # fmt: skip
+    """Products of planes and lines [N, 3, channels], or their sum [N], or its `exponentiate`."""
     i = tl.program_id(0) * B + tl.arange(0, B)
     is_position = i < positions
     x, y = tl.load(unit + i, is_position, 0.0), tl.load(unit + positions + i, is_position, 0.0)
@@ -63,13 +59,14 @@ def multiply(
         else:
             tl.store(out + (i[:, None] * 3 + mode) * channels + channel, plane * line, mask)
     if IS_SUM:
-        tl.store(out + i, tl.sum(total, axis=1), is_position)
+        value = tl.sum(total, axis=1)
+        tl.store(out + i, exponentiate(value, scale) if IS_EXP else value, is_position)
 
 
 @kernel()
 def scatter(
-    planes, lines, unit, grad, grad_planes, grad_lines, positions, side, channels,
-    IS_SUM: tl.constexpr, C: tl.constexpr, B: tl.constexpr,
+    planes, lines, unit, out, grad, grad_planes, grad_lines, positions, side, channels, scale,
+    IS_SUM: tl.constexpr, IS_EXP: tl.constexpr, C: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """Adds the gradient of `multiply` to that of planes and lines."""
     i = tl.program_id(0) * B + tl.arange(0, B)
@@ -78,12 +75,15 @@ def scatter(
     z = tl.load(unit + 2 * positions + i, is_position, 0.0)
     channel = tl.arange(0, C)[None, :]
     mask = is_position[:, None] & (channel < channels)
+    grad_sum = tl.load(grad + i, is_position, 0.0) if IS_SUM else tl.zeros([B], tl.float32)
+    if IS_EXP:
+        grad_sum *= exp_slope(tl.load(out + i, is_position, 0.0), scale)
     for mode in tl.static_range(3):
         plane, line, corner, vertex, wr, wc, wl = interpolate(
             planes, lines, mode, x, y, z, side, channels, is_position, C
         )
         if IS_SUM:
-            above = tl.load(grad + i, is_position, 0.0)[:, None] + tl.zeros([B, C], tl.float32)
+            above = grad_sum[:, None] + tl.zeros([B, C], tl.float32)
         else:
             above = tl.load(grad + (i[:, None] * 3 + mode) * channels + channel, mask, 0.0)
         p = grad_planes + (corner * channels)[:, None] + channel
@@ -98,23 +98,26 @@ def scatter(
 
 
 class PlaneLine(torch.autograd.Function):
-    """`kernels.plane_line_products` or, if summed, `kernels.plane_line_sum`."""
+    """`kernels.plane_line_products` or, if summed, `kernels.plane_line_sum`, with or without `truncated_exp` over a scale."""
 
     @staticmethod
-    def forward(ctx, planes: Tensor, lines: Tensor, unit: Tensor, is_sum: bool) -> Tensor:
+    def forward(
+        ctx, planes: Tensor, lines: Tensor, unit: Tensor, is_sum: bool, is_exp: bool = False, scale: float = 1.0
+    ) -> Tensor:
         _, side, channels = lines.shape
         planes, lines, coords = planes.contiguous(), lines.contiguous(), unit.T.contiguous()
         out = unit.new_empty(len(unit)) if is_sum else unit.new_empty(len(unit), 3 * channels)
-        ctx.shape = len(unit), side, channels
-        ctx.constants = {"IS_SUM": is_sum, "C": triton.next_power_of_2(channels), "B": BLOCK}
+        ctx.shape = len(unit), side, channels, scale
+        ctx.constants = {"IS_SUM": is_sum, "IS_EXP": is_exp, "C": triton.next_power_of_2(channels), "B": BLOCK}
         multiply((triton.cdiv(len(unit), BLOCK),), planes, lines, coords, out, *ctx.shape, **ctx.constants)
-        ctx.save_for_backward(planes, lines, coords)
+        ctx.save_for_backward(planes, lines, coords, out if is_exp else lines)
         return out
 
     @staticmethod
     def backward(ctx, grad: Tensor):
-        planes, lines, coords = ctx.saved_tensors
-        gradients = torch.zeros_like(planes), torch.zeros_like(lines)
+        planes, lines, coords, _ = ctx.saved_tensors
+        both = planes.new_zeros(planes.numel() + lines.numel())
+        gradients = both[: planes.numel()].view_as(planes), both[planes.numel() :].view_as(lines)
         grid = (triton.cdiv(coords.shape[1], BLOCK),)
-        scatter(grid, planes, lines, coords, grad.contiguous(), *gradients, *ctx.shape, **ctx.constants)
-        return *gradients, None, None
+        scatter(grid, *ctx.saved_tensors, grad.contiguous(), *gradients, *ctx.shape, **ctx.constants)
+        return *gradients, None, None, None, None
