@@ -54,11 +54,11 @@ def opacity_loss(
     pixels: UInt8[Tensor, "R 4"],
     weights: Float[Tensor, "R"] | None,
     complete: Bool[Tensor, "R"] | None,
-) -> Float[Tensor, ""]:
+) -> tuple[Float[Tensor, ""], Float[Tensor, "R"]]:
     """What random background colors add to the photometric loss on their mean; arguments as in `photometric_loss`.
 
     A channel's error on a background b is e + (alpha - opacity) * (b - mean): its expected square adds the variance of b times
     the squared error of the opacity. This mean over all colors has less noise than one color per ray.
     """
-    alpha = pixels[:, 3:] / 255
-    return RANDOM_VARIANCE * mean_squared_error(opacity[:, None], alpha, weights, complete)[0]
+    loss, squared_errors = mean_squared_error(opacity[:, None], pixels[:, 3:] / 255, weights, complete)
+    return RANDOM_VARIANCE * loss, RANDOM_VARIANCE * squared_errors

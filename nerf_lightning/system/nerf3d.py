@@ -167,7 +167,8 @@ class NeRF3D(System):
             loss, squared_errors = mean_squared_error(rgb, truth, *weights)
         losses = {"photometric": loss, **self.regularize(output, samples, batch)}
         if self.renderer.background.is_random:
-            losses["opacity"] = opacity_loss(output.opacity, batch.pixels, *weights)
+            losses["opacity"], opacity_errors = opacity_loss(output.opacity, batch.pixels, *weights)
+            squared_errors = squared_errors + opacity_errors
         per_ray = self.sampler.samples_per_ray
         stats = StepStats(
             losses["photometric"].detach(),
