@@ -150,8 +150,8 @@ LARGE_PLANES = [
     f"model.{option}" for option in ("base_resolution=302", "max_resolution=302", "stages=1", "width=64", "size=fixed")
 ]
 BYTES = {
-    "tensorf_medium": ([*LARGE_PLANES, "sampler.resolution=120"], 12_348, (457e3, 125e3), 1.34e9),
-    "hashgrid_medium": (["model.size=fixed"], 8446, (144e3, 53e3), 0.6e9),
+    "tensorf_medium": ([*LARGE_PLANES, "sampler.resolution=120"], 12_348, (457e3, 125e3), 1.1e9),
+    "hashgrid_medium": (["model.size=fixed"], 8446, (144e3, 53e3), 0.48e9),
 }
 """Options, rays, their steps in occupied cells and visible ones, at photos of 800 pixels; bytes that a step moves at most."""
 

@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from nerf_lightning.kernels import volume_weights
+from nerf_lightning.kernels import median_depth, volume_weights
 from nerf_lightning.kernels.weight_losses import distortion_loss, near_loss, view_loss
-from nerf_lightning.renderer.renderer import median_depth
 from nerf_lightning.sampler import Samples
 from tests.helpers.ragged_samples import SAMPLE_COUNTS, make_ragged_samples
 
@@ -97,7 +96,7 @@ def test_median_depth_halves_opacity(counts: list[int]):
         return 1 - math.exp(-float((density[part] * (distance - start).clamp_min(0).minimum(samples.dt[part])).sum()))
 
     opacity = torch.tensor([opacity_before(ray, math.inf) for ray in range(len(counts))], dtype=torch.float64)
-    depth = median_depth(density, opacity, samples)
+    depth = median_depth(density, opacity, (samples.t, samples.dt, samples.ray, samples.offsets))
     for ray, count in enumerate(counts):
         if count:
             assert opacity_before(ray, float(depth[ray])) == pytest.approx(float(opacity[ray]) / 2, rel=1e-6)
@@ -109,5 +108,5 @@ def test_median_depth_ignores_long_last_interval():
     samples = make_ragged_samples([3])
     samples.dt[2], samples.t[2] = 1000, 500
     density = torch.tensor([0.0, 1e3, 1e-5])
-    depth = median_depth(density, torch.tensor([0.99]), samples)
+    depth = median_depth(density, torch.tensor([0.99]), (samples.t, samples.dt, samples.ray, samples.offsets))
     assert abs(float(depth) - float(samples.t[1])) < float(samples.dt[1])

@@ -118,7 +118,7 @@ def make_checks(device: torch.device) -> dict[str, tuple[Callable[..., Any], lis
         "proposal_weights": (lambda x: [kernels.proposal_weights(x, shares, -1.0, 0.5)], [rand(24 * NUM_RAYS, 2)]),
         "interlevel_loss": (lambda x: [kernels.interlevel_loss(x, edges, edges[:, :17], main)], [shares / 40]),
         "weight_losses": (
-            lambda *x: kernels.weight_losses(*x, *penalties).values(),
+            lambda a, b: kernels.weight_losses(a, b, *penalties).values(),
             [rand(len(exact[0])), rand(len(exact[0]), 3)],
         ),
     }
