@@ -31,6 +31,7 @@ PARTS = {
     "camera_noise": "loss by pose and exposure errors, and the gain of refine=auto",
     "capture_accuracy": "pose and lens errors of a synthetic capture with tags",
     "capture_quality": "photos with a background: PSNR, depth error and floaters",
+    "objects": "objects of six kinds before a plain background: held-out PSNR",
     "photos": "photos of mixed sizes, with occluders, masks, and a fisheye lens",
     "image_fields": "2D fields against the course's recipe, and on several kinds of images",
     "size_search": "the choice of rightsize against every size trained in full",
@@ -54,7 +55,10 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--budgets", type=parse_list(float), default=[60.0], help="seconds of training")
     parser.add_argument("--seeds", type=parse_list(int), default=[0, 1, 2])
     parser.add_argument("--scenes", type=parse_list(Path), default=[], help="for device, camera_noise, capture_quality")
-    parser.add_argument("--recipes", type=parse_list(str), default=[], help="for device, camera_noise, capture_quality")
+    parser.add_argument(
+        "--recipes", type=parse_list(str), default=[], help="for device, camera_noise, captures, objects"
+    )
+    parser.add_argument("--size", type=int, default=400, help="for objects: width of the photos, pixels")
     parser.add_argument(
         "--device", default="auto", help="for device, methods, agreement, step_time: auto, cpu, cuda, mps"
     )

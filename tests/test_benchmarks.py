@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -13,12 +14,15 @@ from torch import Tensor
 from benchmarks import __main__ as command
 from benchmarks import agreement, camera_noise, device, image_fields, kernel_cases, photos, step_time
 from benchmarks.op_counter import OpCounter, count_kernel_bytes
+from benchmarks.synthetic.part_tracer import SUPERSAMPLING, Tracer
+from benchmarks.synthetic.parts import BALL, BOX, CYLINDER, Material, make_part
 from benchmarks.tables import list_differences
 from nerf_lightning import kernels
 from nerf_lightning.cameras import transform_poses
 from nerf_lightning.config.compose import compose_config
 from nerf_lightning.dataset import save_npz
 from nerf_lightning.synthetic.bricks import bricks
+from nerf_lightning.synthetic.objects import Box, Sphere, make_hemisphere_cameras, render_photos
 from nerf_lightning.training.train import train
 from nerf_lightning.utils.device import CPU
 from tests.helpers.soft_ball import make_ball_cameras
@@ -36,6 +40,25 @@ def test_camera_errors_common_motion_does_not_count():
     c2w[2, :3, :2] = c2w[2, :3, :2] @ torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
     found = camera_noise.measure_camera_errors(replace(truth, c2w=c2w), truth, center)
     assert found["degrees"] == pytest.approx(math.degrees(0.1) / 6, rel=1e-2) and found["moved_percent"] < 0.01
+
+
+def test_tracer_agrees_with_primitives_shadows_and_absorbs():
+    gray, cameras = Material((0.5, 0.5, 0.5)), make_hemisphere_cameras(3, 24)
+    parts = [
+        make_part(BALL, (0.3, 0.2, 0.1), (0.5, 0.5, 0.5), gray),
+        make_part(BOX, (-0.5, -0.3, 0), (0.3, 0.4, 0.2), gray),
+    ]
+    alpha = np.stack([Tracer(parts).render(cameras, view)[..., 3] for view in range(3)])
+    primitives = [Sphere((0.3, 0.2, 0.1), 0.5), Box((-0.8, -0.7, -0.2), (-0.2, 0.1, 0.2))]
+    truth = render_photos(primitives, cameras, None, SUPERSAMPLING)[..., 3].numpy()
+    assert (alpha == truth).mean() > 0.99 and 0.1 < (truth > 0).mean() < 0.9
+    plate = make_part(CYLINDER, (0, 0, -0.5), (1.5, 1.5, 0.1), gray)
+    points, down = np.array([[0.0, 0.0, -0.4], [1.4, -1.4, -0.4]]) * [0.9, 0.9, 1], np.array([[0.0, 0.0, -1.0]] * 2)
+    shaded, bright = Tracer([plate, parts[0]]).shade(np.array([0, 0]), points, down)[:, 0]
+    assert shaded < 0.7 * bright and bright < 1
+    jelly = make_part(BALL, (0, 0, 0), (0.5, 0.5, 0.5), Material((0.8, 0.1, 0.1), absorption=1.5))
+    center = Tracer([jelly]).render(cameras, 1)[11:13, 11:13, 3].mean() / 255  # through the whole diameter
+    assert center == pytest.approx(1 - math.exp(-1.5), abs=0.01)
 
 
 @pytest.fixture

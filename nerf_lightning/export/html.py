@@ -34,7 +34,11 @@ MAX_PHOTOS = 100
 
 
 def build_page(
-    source: Path, device: torch.device, cells: int | None = None, max_psnr_drop: float = 0.15, photos: Path | None = None
+    source: Path,
+    device: torch.device,
+    cells: int | None = None,
+    max_psnr_drop: float = 0.15,
+    photos: Path | None = None,
 ) -> tuple[str, str]:
     """Builds a run's web page; returns it with a summary. Options as in `cli.export.export_html`."""
     run = open_run(source, device)

@@ -69,8 +69,8 @@ class VolumeRenderer(torch.nn.Module):
     """Volume rendering (NeRF, Mildenhall et al. 2020, eq. 3) over a background, and losses on the rendering weights.
 
     Args:
-        background: "scene" (the scene's color), "black", "white", "random" (random per training ray, "scene" in evaluation;
-            needs images with alpha), "auto" ("random" with alpha, else "scene"), or three numbers in [0, 1].
+        background: "scene" (the scene's color), "black", "white", "random" (in training the mean over random colors, "scene" in
+            evaluation; needs images with alpha), "auto" ("random" with alpha, else "scene"), or three numbers in [0, 1].
         scene_background: the color of "scene".
         distortion_loss_weight: weight of `distortion_loss`, against fog.
         near_loss_weight: initial weight of `near_loss`, against density near the cameras; it fades out.
@@ -110,7 +110,7 @@ class VolumeRenderer(torch.nn.Module):
     ) -> RenderOutput:
         """Renders rays over `backgrounds`, by default the renderer's background."""
         if backgrounds is None:
-            backgrounds = self.background.sample(len(rays))
+            backgrounds = self.background.expand(len(rays))
         # Proposals put samples of even weight close together; others are merged by weight already.
         is_dense = self.unbounded and samples.optical_depth is None and not torch.is_grad_enabled()
         if is_dense and isinstance(field, HashGridField) and field.view_residual:

@@ -17,6 +17,7 @@ from nerf_lightning.kernels.backend import get_kernels
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import RenderOutput, VolumeRenderer, composite_over
+from nerf_lightning.renderer.background import opacity_loss
 from nerf_lightning.sampler import CHUNK, Sampler, Samples, split_by_rays
 from nerf_lightning.system.correction_trial import CorrectionTrials
 from nerf_lightning.system.growth import FieldGrowth, sync_resolution_scale
@@ -153,7 +154,7 @@ class NeRF3D(System):
             rays = self.corrections.poses(rays, batch.views)
         with torch.no_grad():
             samples = self.sampler(rays.detach(), self.field.density, generator)
-        backgrounds = self.renderer.background.sample(len(rays), generator)
+        backgrounds = self.renderer.background.expand(len(rays), is_training=True)
         output = self.renderer(rays, samples, self.field, backgrounds)
         weights = batch.weights, samples.complete
         if self.corrections is None:
@@ -165,6 +166,9 @@ class NeRF3D(System):
             rgb = self.corrections.color(output.rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
             loss, squared_errors = mean_squared_error(rgb, truth, *weights)
         losses = {"photometric": loss, **self.regularize(output, samples, batch)}
+        if self.renderer.background.is_random:
+            losses["opacity"], opacity_errors = opacity_loss(output.opacity, batch.pixels, *weights)
+            squared_errors = squared_errors + opacity_errors
         per_ray = self.sampler.samples_per_ray
         stats = StepStats(
             losses["photometric"].detach(),
@@ -255,7 +259,7 @@ class NeRF3D(System):
         return [round(c, 3) for c in self.renderer.background.color.tolist()]
 
     def compute_target_rgb(self, batch: RayBatch) -> Tensor:
-        return composite_over(batch.pixels, self.renderer.background.sample(len(batch.rays)))
+        return composite_over(batch.pixels, self.renderer.background.expand(len(batch.rays)))
 
     def render_view(self, view: ViewBatch) -> tuple[Tensor, Tensor, Tensor]:
         rendered = self.render(view.rays)

@@ -5,7 +5,8 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.model import FieldOutput, HashGridField
-from nerf_lightning.renderer import VolumeRenderer, renderer
+from nerf_lightning.renderer import VolumeRenderer, composite_over, renderer
+from nerf_lightning.renderer.background import opacity_loss
 from nerf_lightning.sampler import ProposalSampler, UniformSampler
 from tests.helpers.ragged_samples import make_ragged_samples
 
@@ -77,14 +78,21 @@ def test_render_without_gradient_returns_no_sample_tensors():
     assert output.weights is None and output.view_residual is None
 
 
-def test_backgrounds_random_need_generator():
-    renderer = VolumeRenderer("random", SCENE)
-    first, again, other = (renderer.background.sample(1000, Generator().manual_seed(seed)) for seed in (1, 1, 2))
-    assert torch.equal(first, again) and not torch.equal(first, other)
-    assert first.std(0).min() > 0.2 and first.min() >= 0 and first.max() <= 1
-    assert torch.equal(renderer.background.sample(2), torch.tensor(SCENE).expand(2, 3))
-    colors = VolumeRenderer("white").background.sample(2, Generator())
-    assert torch.equal(colors, torch.ones(2, 3))
+def test_background_random_is_mean_over_colors():
+    background = VolumeRenderer("random", SCENE).background
+    assert torch.equal(background.expand(2), torch.tensor(SCENE).expand(2, 3))
+    assert torch.equal(VolumeRenderer("white").background.expand(2, is_training=True), torch.ones(2, 3))
+    premultiplied, opacity = torch.tensor([[0.3, 0.1, 0.2]]), torch.tensor([0.4])
+    pixels = torch.tensor([[200, 100, 50, 180]], dtype=torch.uint8)
+
+    def measure_errors(colors: Tensor) -> Tensor:
+        truth = composite_over(pixels.expand(len(colors), 4), colors)
+        return (premultiplied + (1 - opacity) * colors - truth).square().mean(1)
+
+    expected = measure_errors(torch.rand(200_000, 3, generator=Generator().manual_seed(0))).mean()
+    gray = measure_errors(background.expand(1, is_training=True))[0]
+    torch.testing.assert_close(gray + opacity_loss(opacity, pixels, None, None)[0], expected, rtol=1e-2, atol=0.0)
+    assert gray < 0.9 * expected and opacity_loss(opacity, pixels, None, torch.tensor([False]))[0] == 0
 
 
 @pytest.mark.parametrize("background", ["green", [0.1, 0.2, 0.3, 0.4], [0, 0, 1.5]])
