@@ -20,7 +20,11 @@ VisibleSamples = tuple[Float[Tensor, "K"], PackedSelection, Bool[Tensor, "R"] | 
 
 
 def volume_weights(
-    density: Float[Tensor, "N"], dt: Float[Tensor, "N"], ray: Int[Tensor, "N"], offsets: Int[Tensor, "R_plus_1"]
+    density: Float[Tensor, "N"],
+    dt: Float[Tensor, "N"],
+    ray: Int[Tensor, "N"],
+    offsets: Int[Tensor, "R_plus_1"],
+    per_ray: int | None = None,
 ) -> Float[Tensor, "N"]:
     """Rendering weights w_i = T_i (1 - exp(-sigma_i dt_i)) with transmittance T_i = exp(-sum_{j < i} sigma_j dt_j).
 
@@ -29,12 +33,20 @@ def volume_weights(
         dt: interval lengths, world units.
         ray: ray of each sample, ascending.
         offsets: first sample of each ray, then N.
+        per_ray: samples of each ray, if all have as many.
 
     Returns:
         Weights in [0, 1]; their sum over a ray is its opacity.
     """
+    if per_ray and has_gpu_kernel(density, constants=(dt,)) and gpu.resampling.is_supported(dt.view(-1, per_ray)):
+        return gpu.resampling.IntervalWeights.apply(density, dt.view(-1, per_ray), 0.0, 1.0).flatten()
     exponent = -density * dt
     return -torch.exp(exclusive_sum(exponent, ray, offsets)) * torch.expm1(exponent)
+
+
+def interval_weights(optical_depth: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
+    """Rendering weights from optical depths (density times length), see `volume_weights`."""
+    return torch.exp(optical_depth - optical_depth.cumsum(1)) * -torch.expm1(-optical_depth)
 
 
 def composite_reference(
@@ -151,3 +163,32 @@ def filter_visible(
     out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
     cpu.composite.pack_visible(keep, offsets, kept, optical_depth, t, dt, out, rays)
     return out[0], (out[1], out[2], rays, kept), None
+
+
+def median_depth_reference(density: Tensor, opacity: Tensor, packed: Packed) -> Float[Tensor, "R"]:
+    """`median_depth` in plain PyTorch, for every device."""
+    t, dt, ray, offsets = packed
+    if not len(t):
+        return torch.zeros_like(opacity)
+    optical_depth = density * dt
+    passed = exclusive_sum(optical_depth, ray, offsets)
+    target_depth = -torch.log1p(-opacity / 2)
+    count_below = torch.nn.functional.pad((passed + optical_depth < target_depth[ray]).cumsum(0), (1, 0))
+    first, last = offsets[:-1], offsets[1:] - 1
+    # Rounding may leave a sum short: clamp to the last sample. Rays without samples read any, and get 0 below.
+    index = torch.minimum(first + count_below[offsets[1:]] - count_below[first], last).clamp_min(0)
+    fraction = ((target_depth - passed[index]) / optical_depth[index].clamp_min(1e-12)).clamp(0, 1)
+    return torch.where(opacity > 0, t[index] + (fraction - 0.5) * dt[index], 0.0)
+
+
+def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], packed: Packed) -> Float[Tensor, "R"]:
+    """Median depth, world units: where each ray reaches half its opacity; 0 for transparent rays.
+
+    Exact for density (1 / world unit) constant within an interval: the optical depth there is -log(1 - opacity / 2).
+    """
+    t, dt, _, offsets = packed
+    if not has_fast_kernel(constants=(density, opacity, t, dt)):
+        return median_depth_reference(density, opacity, packed)
+    depth = torch.empty(len(opacity))
+    cpu.composite.find_median_depth(density, opacity, t, dt, offsets, depth)
+    return depth

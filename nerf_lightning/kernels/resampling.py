@@ -6,8 +6,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import cpu
-from nerf_lightning.kernels.backend import has_fast_kernel
+from nerf_lightning.kernels import cpu, gpu
+from nerf_lightning.kernels.backend import has_fast_kernel, has_gpu_kernel
 
 PDF_EPS = 1e-5
 """Added to all weights, so that rays without weight are divided evenly."""
@@ -34,7 +34,10 @@ def interval_midpoints(
         near, far: distances along each ray.
         s: interval edges in [0, 1], see `Bounds.s_to_t`.
     """
-    if not has_fast_kernel(constants=(rays.origins, rays.directions, near, far, s)):
+    inputs = rays.origins, rays.directions, near, far, s
+    if bounds.unbounded and has_gpu_kernel(constants=inputs):
+        return gpu.resampling.interval_midpoints(rays, bounds, near, far, s)
+    if not has_fast_kernel(constants=inputs):
         return interval_midpoints_reference(rays, bounds, near, far, s)
     count, steps = len(s), s.shape[1] - 1
     inside = bounds.content_interval(rays) if bounds.unbounded else torch.empty(0, 2)
@@ -58,6 +61,12 @@ def invert_cdf(
     return start + fraction * (end - start)
 
 
+def resample_reference(s: Tensor, pdf: Tensor, shift: Tensor, count: int) -> Tensor:
+    """`resample` in plain PyTorch, for every device."""
+    u = (torch.arange(count + 1, device=s.device) + shift[:, None]) / count
+    return invert_cdf(s, pdf, u.clamp(0, 1))
+
+
 def resample(
     s: Float[Tensor, "R S_plus_1"], pdf: Float[Tensor, "R S"], shift: Float[Tensor, "R"], count: int
 ) -> Float[Tensor, "R K_plus_1"]:
@@ -68,9 +77,10 @@ def resample(
         pdf: probability of each old interval; about 1 in total.
         shift: shift of each ray's edges, in new intervals.
     """
+    if has_gpu_kernel(constants=(s, pdf, shift)) and gpu.resampling.is_supported(pdf):
+        return gpu.resampling.resample(s, pdf, shift, count)
     if not has_fast_kernel(s, pdf, shift):
-        u = (torch.arange(count + 1, device=s.device) + shift[:, None]) / count
-        return invert_cdf(s, pdf, u.clamp(0, 1))
+        return resample_reference(s, pdf, shift, count)
     out = torch.empty(len(s), count + 1)
     cpu.resampling.resample(s, pdf, shift, np.float32(PDF_EPS), out)
     return out

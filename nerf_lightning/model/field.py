@@ -72,6 +72,8 @@ class Field(BoundedModule, BaseField):
 
     stage: int = 0
     """Current stage of `growth`."""
+    cpu_chunks: int = 1
+    """Samples evaluated together on a CPU without gradient, in multiples of `Sampler.chunk`."""
 
     @property
     def resolution_scale(self) -> float:

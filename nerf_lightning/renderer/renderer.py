@@ -9,13 +9,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.kernels import composite, volume_weights
-from nerf_lightning.kernels.segment_sums import exclusive_sum
-from nerf_lightning.model import FieldOutput
+from nerf_lightning.kernels import average_neighbors, composite, median_depth, volume_weights, weight_losses
+from nerf_lightning.model import FieldOutput, HashGridField
 from nerf_lightning.renderer.background import Background
-from nerf_lightning.renderer.losses import AUTO_VIEW_LOSS_WEIGHT, NEAR_LOSS_END, distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 from nerf_lightning.utils.option_checks import LossWeight
+
+SHADING_GROUP = 4
+"""Neighboring samples that share a view-dependent residual in evaluation of unbounded scenes."""
+NEAR_LOSS_END = 0.7
+"""Training progress at which the near loss has faded out, so that surfaces it pushed back can recover."""
+AUTO_VIEW_LOSS_WEIGHT = {False: 0.01, True: 0.001}
+"""Automatic weight of the view loss, by `unbounded`. A bounded subject was often turned before the camera, with the light
+fixed; in unbounded scenes view dependence also absorbs exposure changes."""
 
 FieldFn = Callable[[Float[Tensor, "N 3"], Float[Tensor, "N 3"]], FieldOutput | tuple[Tensor, Tensor]]
 """World positions and unit directions -> density (1 / world unit) and rgb in [0, 1], see `FieldOutput`."""
@@ -51,22 +57,12 @@ class RenderOutput:
         return self.distance / self.opacity.clamp_min(1e-6)
 
 
-def median_depth(density: Float[Tensor, "N"], opacity: Float[Tensor, "R"], samples: Samples) -> Float[Tensor, "R"]:
-    """Median depth, world units: where each ray reaches half its opacity; 0 for transparent rays.
-
-    Exact for density (1 / world unit) constant within an interval: the optical depth there is -log(1 - opacity / 2).
-    """
-    if not len(samples):
-        return torch.zeros_like(opacity)
-    optical_depth = density * samples.dt
-    passed = exclusive_sum(optical_depth, samples.ray, samples.offsets)
-    target_depth = -torch.log1p(-opacity / 2)
-    count_below = torch.nn.functional.pad((passed + optical_depth < target_depth[samples.ray]).cumsum(0), (1, 0))
-    first, last = samples.offsets[:-1], samples.offsets[1:] - 1
-    # Rounding may leave a sum short: clamp to the last sample. Rays without samples read any, and get 0 below.
-    index = torch.minimum(first + count_below[samples.offsets[1:]] - count_below[first], last).clamp_min(0)
-    fraction = ((target_depth - passed[index]) / optical_depth[index].clamp_min(1e-12)).clamp(0, 1)
-    return torch.where(opacity > 0, samples.t[index] + (fraction - 0.5) * samples.dt[index], 0.0)
+def shade_groups(field: HashGridField, rays: Rays, samples: Samples) -> FieldOutput:
+    """Field at samples, with one view-dependent residual for every `SHADING_GROUP` neighbors, of their mean features."""
+    density, features = field.features(samples.positions(rays), field.unit_length)
+    means, index, ray = average_neighbors(density * samples.dt, features, samples.ray, samples.offsets, SHADING_GROUP)
+    residual = field.view_logits(means, rays.directions.index_select(0, ray))
+    return FieldOutput(density, field.shade(features, residual.T.index_select(1, index).T))
 
 
 class VolumeRenderer(torch.nn.Module):
@@ -115,18 +111,23 @@ class VolumeRenderer(torch.nn.Module):
         """Renders rays over `backgrounds`, by default the renderer's background."""
         if backgrounds is None:
             backgrounds = self.background.sample(len(rays))
-        density, rgb, view_residual = FieldOutput(*field(samples.positions(rays), samples.directions(rays)))
+        if self.unbounded and isinstance(field, HashGridField) and field.view_residual and not torch.is_grad_enabled():
+            density, rgb, view_residual = shade_groups(field, rays, samples)
+        else:
+            density, rgb, view_residual = FieldOutput(*field(samples.positions(rays), samples.directions(rays)))
         has_gradient = density.requires_grad
         if samples.optical_depth is not None and not has_gradient:
             density = samples.optical_depth / samples.dt
-        foreground, opacity, distance = composite(density, rgb, samples.t, samples.dt, samples.ray, samples.offsets)
+        packed = samples.t, samples.dt, samples.ray, samples.offsets
+        foreground, opacity, distance = composite(density, rgb, *packed)
         if self.unbounded and not has_gradient:
             # Median for unbounded scenes: 1 % of stray weight at the far plane would dominate the mean.
-            distance = opacity * median_depth(density, opacity, samples)
+            distance = opacity * median_depth(density, opacity, packed)
         has_losses = self.distortion_loss_weight or self.near_loss_weight or self.view_loss_weight
         if not (self.training and has_gradient and (has_losses or samples.proposals is not None)):
             return RenderOutput(foreground, opacity, distance, backgrounds)  # a full view has too many samples to keep
-        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
+        per_ray = None if samples.proposals is None else samples.proposals.edges.shape[1] - 1
+        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets, per_ray)
         return RenderOutput(foreground, opacity, distance, backgrounds, weights, view_residual)
 
     def losses(
@@ -140,15 +141,9 @@ class VolumeRenderer(torch.nn.Module):
             progress: training progress in [0, 1].
             texturelessness: texturelessness of each ray's pixel, for `view_loss`.
         """
-        losses: dict[str, Tensor] = {}
         if output.weights is None:
-            return losses
-        if self.distortion_loss_weight:
-            distortion = distortion_loss(output.weights, samples, self.half_size)
-            losses["distortion"] = self.distortion_loss_weight * distortion
-        if near_weight := self.near_loss_weight * max(0.0, 1 - progress / NEAR_LOSS_END):
-            losses["near"] = near_weight * near_loss(output.weights, samples, self.half_size)
-        if self.view_loss_weight and output.view_residual is not None:
-            penalty = view_loss(output.weights, output.view_residual, samples, texturelessness)
-            losses["view"] = self.view_loss_weight * penalty
-        return losses
+            return {}
+        near_weight = self.near_loss_weight * max(0.0, 1 - progress / NEAR_LOSS_END)
+        factors = self.distortion_loss_weight, near_weight, self.view_loss_weight
+        inputs = output.weights, output.view_residual, samples.packed, self.half_size
+        return weight_losses(*inputs, factors, texturelessness)

@@ -1,5 +1,6 @@
 """Proposal network sampling (mip-NeRF 360): a small density field predicts where to sample the main field."""
 
+import functools
 from typing import Annotated, Any
 
 import torch
@@ -7,16 +8,27 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import interval_midpoints, resample
+from nerf_lightning.kernels import interlevel_loss, interval_midpoints, proposal_weights, resample
+from nerf_lightning.kernels.cached_constants import cache_constants
 from nerf_lightning.model.hashgrid import HashGrid, cubic_cells
 from nerf_lightning.sampler.occupancy import OccupancySampler
-from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposals, Sampler, Samples, interval_weights
+from nerf_lightning.sampler.samples import CHUNK, DensityFn, Histogram, Proposals, Sampler, Samples
 from nerf_lightning.utils.option_checks import Count, GridSize, Gt, Layers, Le, Log2Size, Lt
 
 INIT_LOG_DENSITY = -1.0
 """Initial log-density of the proposal field, 1 / half-size: thin fog."""
 ANNEAL_SLOPE = 10.0
 """Slope of the annealing bias curve (mip-NeRF 360, section 3.2)."""
+
+
+@cache_constants
+def _make_even_edges(
+    intervals: int, device: torch.device
+) -> tuple[Float[Tensor, "S_plus_1"], Float[Tensor, "S_plus_1"]]:
+    """Even edges in [0, 1], and the divisors of a shift in intervals, infinite at both ends."""
+    divisors = torch.full((intervals + 1,), float(intervals))
+    divisors[0] = divisors[-1] = torch.inf
+    return torch.linspace(0, 1, intervals + 1, device=device), divisors.to(device)
 
 
 class ProposalSampler(Sampler):
@@ -67,6 +79,11 @@ class ProposalSampler(Sampler):
         """First training step; annealing counts from it."""
         self.step = 0
 
+    @property
+    def ray_chunk_size(self) -> int:
+        """Rays sampled together; more on a CPU, which loads each level's table into its cache less often."""
+        return max(1, self.chunk // 4) if self.grid.tables.device.type == "cpu" else super().ray_chunk_size
+
     def param_groups(self) -> list[dict[str, Any]]:
         return [{"name": "sampler", "params": list(self.parameters())}]
 
@@ -76,29 +93,26 @@ class ProposalSampler(Sampler):
     def forward(self, rays: Rays, density: DensityFn, generator: Generator | None = None) -> Samples:
         near, far = self.bounds.near_far(rays)
         count, device = len(rays), near.device
-        s = torch.linspace(0, 1, self.coarse_samples + 1, device=device).expand(count, -1)
-        if generator is not None:
-            jitter = self._jitter(rays, generator) / self.coarse_samples
-            s = torch.cat([s[:, :1], s[:, 1:-1] + jitter, s[:, -1:]], dim=1)
+        if generator is None:
+            shifts = torch.zeros(3, count, device=device).unbind()
+        else:  # in intervals, uniform in [-1/2, 1/2); new tensors, as kernels are compiled for their alignment
+            uniform = torch.rand(3, count, generator=generator, device=device)
+            shifts = torch._foreach_sub(uniform.unbind(), 0.5)
+        even, divisors = _make_even_edges(self.coarse_samples, device)
+        s = torch.addcdiv(even, shifts[0][:, None], divisors)
         histograms: list[Histogram] = []
-        for num_samples in (self.fine_samples, self.samples):
+        for num_samples, shift in ((self.fine_samples, shifts[1]), (self.samples, shifts[2])):
             with torch.set_grad_enabled(generator is not None):
                 histograms.append(Histogram(s, self.weights(rays, near, far, s)))
             pdf = histograms[-1].weights.detach() + self.histogram_padding / s.shape[1]
             if generator is not None:
                 pdf = pdf**self.anneal_exponent
-            s = resample(s, pdf, self._jitter(rays, generator)[:, 0], num_samples)
+            s = resample(s, pdf, shift, num_samples)
         _, t, dt = interval_midpoints(rays, self.bounds, near, far, s)
         ray = torch.arange(count, device=device).repeat_interleave(self.samples)
         offsets = torch.arange(count + 1, device=device) * self.samples
         proposals = None if generator is None else Proposals(tuple(histograms), s)
         return Samples(t.flatten(), dt.flatten(), ray, offsets, proposals=proposals)
-
-    def _jitter(self, rays: Rays, generator: Generator | None) -> Float[Tensor, "R 1"]:
-        """Shift of the edges in intervals, uniform in [-1/2, 1/2); zero without a generator."""
-        if generator is None:
-            return torch.zeros(len(rays), 1, device=rays.origins.device)
-        return torch.rand(len(rays), 1, generator=generator, device=rays.origins.device) - 0.5
 
     @property
     def anneal_exponent(self) -> float:
@@ -110,17 +124,16 @@ class ProposalSampler(Sampler):
         self, rays: Rays, near: Float[Tensor, "R"], far: Float[Tensor, "R"], s: Float[Tensor, "R S_plus_1"]
     ) -> Float[Tensor, "R S"]:
         """Rendering weights of the proposal field, see `volume_weights`."""
-        unit, t, dt = interval_midpoints(rays, self.bounds, near, far, s)
-        density = torch.exp(self.grid(unit).sum(1) + INIT_LOG_DENSITY)
-        return interval_weights(density.view(t.shape) * (dt / self.unit_length))
+        unit, _, dt = interval_midpoints(rays, self.bounds, near, far, s)
+        return proposal_weights(self.grid(unit), dt, INIT_LOG_DENSITY, self.unit_length)
 
     def losses(self, samples: Samples, weights: Float[Tensor, "N"] | None) -> dict[str, Float[Tensor, ""]]:
         if samples.proposals is None or weights is None:
             return {}
         histograms, edges = samples.proposals
         main_weights = weights.detach().view(len(edges), -1)
-        terms = [interlevel_loss(edges, main_weights, histogram) for histogram in histograms]
-        return {"interlevel": torch.stack(terms).sum()}
+        terms = [interlevel_loss(found.weights, found.edges, edges, main_weights) for found in histograms]
+        return {"interlevel": functools.reduce(torch.add, terms)}
 
     @torch.no_grad()
     def restart(self, step: int) -> None:
@@ -129,24 +142,6 @@ class ProposalSampler(Sampler):
 
     def update(self, step: int, density: DensityFn, generator: Generator) -> None:
         self.step = step
-
-
-def interlevel_loss(
-    edges: Float[Tensor, "R K_plus_1"], weights: Float[Tensor, "R K"], proposed: Histogram
-) -> Float[Tensor, ""]:
-    """Interlevel loss, mip-NeRF 360 eq. 12 and 13, mean over rays: penalizes weight above the proposal histogram's bound.
-
-    Args:
-        edges, weights: intervals of the main field.
-        proposed: histogram of the proposal field, with gradient.
-    """
-    last = proposed.weights.shape[1]
-    sums = torch.nn.functional.pad(proposed.weights.cumsum(1), (1, 0))
-    proposed_edges = proposed.edges.contiguous()
-    low = (torch.searchsorted(proposed_edges, edges[:, :-1].contiguous(), right=True) - 1).clamp(0, last)
-    high = torch.searchsorted(proposed_edges, edges[:, 1:].contiguous()).clamp(0, last)
-    bound = sums.gather(1, high) - sums.gather(1, low)
-    return ((weights - bound).clamp_min(0) ** 2 / (weights + 1e-5)).sum(1).mean()
 
 
 def choose_sampler(bounds: Bounds, chunk: int = CHUNK) -> Sampler:

@@ -11,6 +11,7 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import BoundedModule, Bounds, Cameras, Rays
 from nerf_lightning.kernels import merge_low_weight, pack_intervals, ray_positions
+from nerf_lightning.kernels.march import Packed
 
 DensityFn = Callable[[Float[Tensor, "N 3"]], Float[Tensor, "N"]]
 """World positions -> density (1 / world unit)."""
@@ -65,6 +66,11 @@ class Samples:
     def __len__(self) -> int:
         return self.t.shape[0]
 
+    @property
+    def packed(self) -> Packed:
+        """Midpoints, lengths, rays and offsets."""
+        return self.t, self.dt, self.ray, self.offsets
+
     def positions(self, rays: Rays) -> Float[Tensor, "N 3"]:
         """World positions of the midpoints."""
         if self.cached_positions is not None and not rays.origins.requires_grad:
@@ -91,14 +97,8 @@ class Samples:
         """Merges neighboring samples if one has less than `MIN_SAMPLE_WEIGHT`; no-op if the optical depth is unknown."""
         if self.optical_depth is None:
             return self
-        packed = self.t, self.dt, self.ray, self.offsets
-        optical_depth, packed = merge_low_weight(self.optical_depth, packed, MIN_SAMPLE_WEIGHT)
+        optical_depth, packed = merge_low_weight(self.optical_depth, self.packed, MIN_SAMPLE_WEIGHT)
         return Samples(*packed, optical_depth=optical_depth)
-
-
-def interval_weights(optical_depth: Float[Tensor, "R S"]) -> Float[Tensor, "R S"]:
-    """Rendering weights from optical depths (density times length), see `volume_weights`."""
-    return torch.exp(optical_depth - optical_depth.cumsum(1)) * -torch.expm1(-optical_depth)
 
 
 def pack(edges: Float[Tensor, "R S_plus_1"], keep: Bool[Tensor, "R S"]) -> Samples:

@@ -5,8 +5,8 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import invert_cdf
-from nerf_lightning.sampler.samples import CHUNK, DensityFn, Sampler, Samples, interval_weights, pack
+from nerf_lightning.kernels import interval_weights, invert_cdf
+from nerf_lightning.sampler.samples import CHUNK, DensityFn, Sampler, Samples, pack
 from nerf_lightning.utils.option_checks import Count
 
 

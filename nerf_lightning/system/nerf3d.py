@@ -235,6 +235,7 @@ class NeRF3D(System):
         """
         color = self.renderer.background.color if background is None else torch.tensor(background, device=self.device)
         outputs, start, num_rays, max_samples = [], 0, self.chunk_rays, SAMPLE_CHUNKS_PER_PASS * self.chunk
+        chunk_samples = self.chunk * (self.field.cpu_chunks if self.device.type == "cpu" else 1)
         while start < len(rays):
             chunk = rays[start : start + num_rays]
             samples = self.sampler(chunk, self.field.density)
@@ -243,7 +244,7 @@ class NeRF3D(System):
             start += len(chunk)
             if near > 0 or far < math.inf:
                 samples = samples.clip(near, far)
-            for span, part in split_by_rays(samples.merge_low_weight_samples(), self.chunk):
+            for span, part in split_by_rays(samples.merge_low_weight_samples(), chunk_samples):
                 outputs.append(self.renderer(chunk[span], part, self.field, color.expand(len(chunk[span]), 3)))
         names = ("foreground", "opacity", "distance")
         foreground, opacity, distance = (torch.cat([getattr(output, name) for output in outputs]) for name in names)

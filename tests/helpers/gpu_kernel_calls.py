@@ -119,6 +119,67 @@ def run_network(widths: list[int], num_extra: int, num_head: int, count: int, *a
     return call, [x, torch.randn(count, num_extra), *parameters], (1,)
 
 
+def locate_midpoints(num_rays: int, steps: int) -> Call:
+    bounds = Bounds(torch.tensor([[-1.0, -1.1, -0.9], [1, 1.05, 1]]), unbounded=True)
+    origins, directions = 2 * torch.randn(num_rays, 3), normalize(torch.randn(num_rays, 3), dim=1)  # some miss the box
+    directions[1] = torch.tensor([0.0, 0, 1])
+    origins[2, 0] = math.nan
+
+    def call(origins: Any, directions: Any, s: Any) -> Any:
+        rays = Rays(origins, directions)
+        return kernels.interval_midpoints(rays, bounds, *bounds.near_far(rays), s)
+
+    return call, [origins, directions, make_edges(num_rays, steps)], (0, 1, 2)
+
+
+def make_edges(num_rays: int, intervals: int) -> torch.Tensor:
+    """Ascending edges in [0, 1], some equal."""
+    edges = torch.rand(num_rays, intervals + 1).sort(1).values
+    edges[:, 3] = edges[:, 2]
+    return edges
+
+
+def resample_rays(num_rays: int, steps: int, count: int) -> Call:
+    pdf = torch.rand(num_rays, steps) + 0.2
+    pdf[1], pdf[2, 4] = 0, math.nan
+    inputs = [make_edges(num_rays, steps), pdf, torch.rand(num_rays) - 0.5]
+    return lambda *inputs: kernels.resample(*inputs, count), inputs, (0, 1, 2)
+
+
+def weigh_proposals(num_rays: int, steps: int, levels: int) -> Call:
+    features = 2 * torch.randn(num_rays * steps, levels)
+    features[:steps], features[-3] = -100, math.nan
+    inputs = [features, torch.rand(num_rays, steps) * (torch.rand(num_rays, steps) < 0.8)]
+    return lambda *inputs: kernels.proposal_weights(*inputs, -1.0, 0.7), inputs, (1,)
+
+
+def weigh_samples(num_rays: int, per_ray: int) -> Call:
+    ray = torch.arange(num_rays).repeat_interleave(per_ray)
+    density, dt, offsets = 9 * torch.rand(len(ray)) ** 3, torch.rand(len(ray)), torch.arange(num_rays + 1) * per_ray
+    return lambda *inputs: kernels.volume_weights(*inputs, per_ray), [density, dt, ray, offsets], (1,)
+
+
+def bound_weights(num_rays: int, count: int, steps: int) -> Call:
+    weights, proposed = torch.rand(num_rays, count) / count, torch.rand(num_rays, steps) / steps
+    weights[1], weights[2, 1], proposed[3] = 0, math.nan, 0
+    edges = torch.cat([make_edges(num_rays - 2, count), torch.linspace(0, 1, count + 1).expand(2, -1)])
+    return kernels.interlevel_loss, [proposed, make_edges(num_rays, steps), edges, weights], (1, 2, 3)
+
+
+def penalize_weights(has_nan: bool) -> Call:
+    samples = make_ragged_samples(RAY_COUNTS)
+    weights, residual = torch.rand(len(samples)) / 5, torch.randn(len(samples), 3)
+    residual[0] = 0
+    if has_nan:
+        weights[-10] = math.nan
+
+    def call(weights: Any, residual: Any, texturelessness: Any) -> Any:
+        factors = 0.5, 2.0, 1.5
+        return list(kernels.weight_losses(weights, residual, samples.packed, 0.7, factors, texturelessness).values())
+
+    return call, [weights, residual, torch.rand(len(RAY_COUNTS))], (0, 1, 2) if has_nan else (2,)
+
+
 def list_calls() -> dict[str, Call]:
     """All calls by name."""
     torch.manual_seed(3)
@@ -139,6 +200,15 @@ def list_calls() -> dict[str, Call]:
         "plane_line_products": multiply_planes(kernels.plane_line_products, 12, 16, 40),
         "plane_line_products, odd channels": multiply_planes(kernels.plane_line_products, 5, 3, 33),
         "plane_line_sum": multiply_planes(kernels.plane_line_sum, 20, 8, 64),
+        "interval_midpoints": locate_midpoints(20, 9),
+        "resample": resample_rays(5, 24, 16),
+        "resample, as many as fit": resample_rays(4, 64, 40),
+        "proposal_weights": weigh_proposals(6, 24, 2),
+        "proposal_weights, one level": weigh_proposals(3, 64, 1),
+        "volume_weights": weigh_samples(5, 16),
+        "interlevel_loss": bound_weights(7, 16, 48),
+        "weight_losses": penalize_weights(False),
+        "weight_losses, NaN": penalize_weights(True),
         "mlp, one hidden layer": run_network([16, 64, 16], 0, 1, 70),
         "mlp, two hidden layers": run_network([31, 64, 64, 3], 16, 0, 100),
         "mlp, odd widths": run_network([60, 24, 3], 12, 2, 5),

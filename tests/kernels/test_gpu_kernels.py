@@ -22,7 +22,7 @@ from nerf_lightning.utils.seeding import Stream, step_generator  # noqa: E402
 from tests.helpers.fake_device import FakeTensor  # noqa: E402
 from tests.helpers.gpu_kernel_calls import list_calls  # noqa: E402
 from tests.helpers.kernel_comparison import values_and_gradients  # noqa: E402
-from tests.test_any_device import build_system_and_data, train_steps  # noqa: E402
+from tests.test_any_device import build_capture, build_system_and_data, train_steps  # noqa: E402
 
 CALLS = list_calls()
 MAX_REGISTERS = 128
@@ -34,9 +34,11 @@ def launched(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
     """The names of the kernels that run."""
     names, run = [], launch.run_kernel
 
-    def run_and_note(kernel: launch.Kernel, *rest: Any) -> None:
+    def run_and_note(kernel: launch.Kernel, grid: Any, arguments: Any, constants: Any) -> None:
         names.append(kernel.name)
-        run(kernel, *rest)
+        on_cpu = [x.cpu_tensor if isinstance(x, FakeTensor) else x for x in arguments]
+        with _disable_current_modes():  # the interpreter's operations are no launches
+            run(kernel, grid, on_cpu, constants)
 
     monkeypatch.setattr(launch, "run_kernel", run_and_note)
     yield names
@@ -67,7 +69,7 @@ def compiled() -> dict[str, Any]:
 
 
 def test_kernels_compile_without_spills(compiled: dict[str, Any]):
-    assert len(compiled["usage"]) == 14
+    assert len(compiled["usage"]) == 19
     for name, by_capability in compiled["usage"].items():
         assert by_capability.keys() == {"75", "80", "90"} - ({"75"} if name.startswith("mlp.") else set())
         for capability, counts in by_capability.items():
@@ -154,3 +156,34 @@ def test_training_step_on_gpu_kernels_needs_few_launches(
         set_kernels("auto")
     assert 20 < count.operations <= MAX_LAUNCHES[name], count.names
     assert not count.waits
+def test_capture_training_on_gpu_kernels_matches_reference(launched: list[str], tmp_path: Path):
+    proposals = ["sampler=proposal", "sampler.samples=5", "sampler.coarse_samples=9", "sampler.fine_samples=6"]
+    losses = {}
+    for choice in ("reference", "triton"):
+        torch.manual_seed(0)
+        system, data = build_capture([*proposals, *SMALL_GRID, "optimizer.lr=0.003"], 2, tmp_path)
+        set_kernels(choice)
+        losses[choice] = train_steps(system, data, 20, torch.device("cpu"))
+    assert losses["triton"] == pytest.approx(losses["reference"], rel=1e-5)
+    assert launched.count("resampling.bound_weights") == 40
+
+
+SMALL_GRID = ["model.num_levels=2", "model.max_resolution=32", "model.log2_hashmap_size=8"]
+MAX_CAPTURE_LAUNCHES = 97
+"""Launches of a capture's training step."""
+
+
+def test_capture_step_on_device_needs_few_launches(launched: list[str], device: torch.device, tmp_path: Path):
+    system, data = build_capture(SMALL_GRID, 4, tmp_path)
+    optimizer = system.to(device).configure_optimizers()
+    set_kernels("triton")
+    for step in range(2):  # the first one makes what is then kept
+        batch, generator = data.draw(step).to(device), step_generator(0, Stream.STEP, step, device)
+        launched.clear()
+        with OpCounter() as count:
+            system.sampler.update(step, system.field.density, generator)
+            sum_losses(system.compute_losses(batch, generator)[0]).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+    assert count.waits == 0
+    assert 20 < count.operations <= MAX_CAPTURE_LAUNCHES, count.names

@@ -77,7 +77,7 @@ def test_run_on_large_photos_has_finer_field(tmp_path: Path, monkeypatch: pytest
     args = ["dataset=photos", f"dataset.path={tmp_path}/scene.npz", "recipe=tensorf_medium", "model.base_resolution=8"]
     args += ["model.size=fixed", "model.width=8", "model.stages=3", "dataset.samples=500", "device=cpu", "~logger"]
     scales: list[float] = []
-    monkeypatch.setattr(RayDataModule, "adapt_num_rays", lambda data, drawn: scales.append(data._resolution_scale))
+    monkeypatch.setattr(RayDataModule, "adapt_num_rays", lambda data, *drawn: scales.append(data._resolution_scale))
     args += ["callbacks.orbit=null", "callbacks.snapshots.steps=[]", "budget.steps=7"]
     train(compose_config(args, tmp_path / "run"))
     system = load_run(tmp_path / "run").system

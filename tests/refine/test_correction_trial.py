@@ -142,7 +142,7 @@ def test_init_from_exif_only_if_exposures_explain_photos(views: Views):
     for photos, brightness, fits in ((exposed, 0.25, True), (views, 1.0, False)):
 
         def darker(rays: Rays, background: Tensor, brightness: float = brightness) -> RenderOutput:
-            return replace(seen := render_ball(rays, background), rgb=seen.rgb * brightness)
+            return replace(seen := render_ball(rays, background), foreground=seen.rgb * brightness, backgrounds=None)
 
         corrections = Corrections(views.cameras, BOX, exposures=exposures, auto=True)
         found = measure_error_reductions(darker, photos, BLACK, corrections, torch.Generator().manual_seed(1))

@@ -5,9 +5,8 @@ import math
 import pytest
 import torch
 
-from nerf_lightning.kernels import volume_weights
-from nerf_lightning.renderer.losses import distortion_loss, near_loss, view_loss
-from nerf_lightning.renderer.renderer import median_depth
+from nerf_lightning.kernels import median_depth, volume_weights
+from nerf_lightning.kernels.weight_losses import distortion_loss, near_loss, view_loss
 from nerf_lightning.sampler import Samples
 from tests.helpers.ragged_samples import SAMPLE_COUNTS, make_ragged_samples
 
@@ -37,7 +36,10 @@ def distortion_over_pairs(density: torch.Tensor, samples: Samples, scale: float)
 def test_distortion_loss_matches_sum_over_pairs(counts: list[int]):
     density, samples = packed(counts)
     density.requires_grad_()
-    fast, slow = distortion_loss(weights(density, samples), samples, 0.7), distortion_over_pairs(density, samples, 0.7)
+    fast, slow = (
+        distortion_loss(weights(density, samples), samples.packed, 0.7),
+        distortion_over_pairs(density, samples, 0.7),
+    )
     torch.testing.assert_close(fast, slow)
     torch.testing.assert_close(torch.autograd.grad(fast, density), torch.autograd.grad(slow, density))
 
@@ -46,9 +48,9 @@ def test_near_loss_falls_with_distance():
     density, samples = packed([6, 6])
     nearness = 0.5 / (samples.t + 0.5)
     w = weights(density, samples)
-    torch.testing.assert_close(near_loss(w, samples, 0.5), (w * nearness**4).view(2, 6).sum(1).mean())
+    torch.testing.assert_close(near_loss(w, samples.packed, 0.5), (w * nearness**4).view(2, 6).sum(1).mean())
     walls = torch.eye(6, dtype=torch.float64)
-    costs = [near_loss(torch.cat([wall, wall]), samples, 0.5) for wall in walls]
+    costs = [near_loss(torch.cat([wall, wall]), samples.packed, 0.5) for wall in walls]
     assert costs == sorted(costs, reverse=True)
 
 
@@ -56,12 +58,12 @@ def test_view_loss_has_no_gradient_of_weights():
     density, samples = packed([6, 0, 3])
     view_part = torch.rand(9, 3, dtype=torch.float64, requires_grad=True)
     w = weights(density.requires_grad_(), samples)
-    loss = view_loss(w, view_part, samples)
+    loss = view_loss(w, view_part, samples.packed)
     rays = [(w[a:b, None] * view_part[a:b] ** 2).sum() for a, b in ((0, 6), (6, 6), (6, 9))]
     torch.testing.assert_close(loss, torch.stack(rays).mean())
     loss.backward()
     assert density.grad is None and view_part.grad is not None
-    assert view_loss(w, torch.zeros(9, 3), samples) == 0
+    assert view_loss(w, torch.zeros(9, 3), samples.packed) == 0
 
 
 def test_view_loss_textureless_pixels_cost_more():
@@ -71,10 +73,13 @@ def test_view_loss_textureless_pixels_cost_more():
     sizes = w * view_part.norm(dim=1)
     extra = 10.0 * (1.0 * sizes[:6].sum() + 0.5 * sizes[6:].sum()) / 3
     torch.testing.assert_close(
-        view_loss(w, view_part, samples, texturelessness) - view_loss(w, view_part, samples), extra, rtol=0.01, atol=0.0
+        view_loss(w, view_part, samples.packed, texturelessness) - view_loss(w, view_part, samples.packed),
+        extra,
+        rtol=0.01,
+        atol=0.0,
     )
     zeros = torch.zeros(9, 3, dtype=torch.float64, requires_grad=True)
-    loss = view_loss(w, zeros, samples, texturelessness)
+    loss = view_loss(w, zeros, samples.packed, texturelessness)
     loss.backward()
     assert loss == 0 and zeros.grad is not None and not zeros.grad.any()
 
@@ -91,7 +96,7 @@ def test_median_depth_halves_opacity(counts: list[int]):
         return 1 - math.exp(-float((density[part] * (distance - start).clamp_min(0).minimum(samples.dt[part])).sum()))
 
     opacity = torch.tensor([opacity_before(ray, math.inf) for ray in range(len(counts))], dtype=torch.float64)
-    depth = median_depth(density, opacity, samples)
+    depth = median_depth(density, opacity, (samples.t, samples.dt, samples.ray, samples.offsets))
     for ray, count in enumerate(counts):
         if count:
             assert opacity_before(ray, float(depth[ray])) == pytest.approx(float(opacity[ray]) / 2, rel=1e-6)
@@ -103,5 +108,5 @@ def test_median_depth_ignores_long_last_interval():
     samples = make_ragged_samples([3])
     samples.dt[2], samples.t[2] = 1000, 500
     density = torch.tensor([0.0, 1e3, 1e-5])
-    depth = median_depth(density, torch.tensor([0.99]), samples)
+    depth = median_depth(density, torch.tensor([0.99]), (samples.t, samples.dt, samples.ray, samples.offsets))
     assert abs(float(depth) - float(samples.t[1])) < float(samples.dt[1])

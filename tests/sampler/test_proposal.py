@@ -5,10 +5,8 @@ import torch
 from torch import Generator
 
 from nerf_lightning.cameras import Bounds, Rays
-from nerf_lightning.kernels import volume_weights
+from nerf_lightning.kernels import interlevel_loss, volume_weights
 from nerf_lightning.sampler import OccupancySampler, ProposalSampler, Samples, choose_sampler
-from nerf_lightning.sampler.proposal import interlevel_loss
-from nerf_lightning.sampler.samples import Histogram
 
 UNBOUNDED = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True, near=0.1)
 
@@ -79,7 +77,7 @@ def test_interlevel_loss_only_unexpected_weight_costs():
 
     def cost(*proposed: float) -> torch.Tensor:
         weights = torch.tensor([proposed], requires_grad=True)
-        loss = interlevel_loss(edges, main_weights, Histogram(torch.linspace(0, 1, len(proposed) + 1)[None], weights))
+        loss = interlevel_loss(weights, torch.linspace(0, 1, len(proposed) + 1)[None], edges, main_weights)
         loss.backward()
         return torch.cat([loss.detach()[None], weights.grad[0]])
 

@@ -7,7 +7,9 @@ import numpy as np
 from numba import float32, int32, prange, uint32
 
 from nerf_lightning.kernels.cpu.jit import jit, kernel
+from nerf_lightning.kernels.cpu.simd import MAX_LANES, interpolate_lanes
 
+LANES, HASHED = (0,) * MAX_LANES, (0,)
 PRIME_Y, PRIME_Z = np.uint32(2654435761), np.uint32(805459861)  # Instant-NGP, eq. 4
 
 
@@ -68,8 +70,26 @@ def cells_of(resolutions, level, axes):
 
 
 @jit
+def interpolate_blocks(table, unit, first, last, cells, factors, out, features, hashed):
+    """Fills whole vectors of out[:, first:last]; returns the first of the columns that remain."""
+    mask = int32(len(table) - 1)
+    while first + len(LANES) <= last:
+        interpolate_lanes(table, unit, first, cells, factors, mask, out, features, hashed, LANES)
+        first += len(LANES)
+    return first
+
+
+@jit
 def interpolate_level(table, unit, first, last, cells, out, axes, features):
     """Fills out[:, first:last]."""
+    if len(axes) == 3:
+        side, area = cells[0] + 1, np.int64(cells[0] + 1) * np.int64(cells[1] + 1)
+        if area * np.int64(cells[2] + 1) <= len(table):
+            factors = int32(1), int32(side), int32(area)
+            first = interpolate_blocks(table, unit, first, last, cells, factors, out, features, ())
+        else:
+            factors = int32(1), int32(PRIME_Y), int32(PRIME_Z)
+            first = interpolate_blocks(table, unit, first, last, cells, factors, out, features, HASHED)
     for n in range(first, last):
         i, w = corners(unit, n, cells, len(table), axes)
         for f in range(len(features)):

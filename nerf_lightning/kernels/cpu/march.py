@@ -25,11 +25,9 @@ def unwarp(y, enter, leave, unit):
     """Inverse of `warp`."""
     one, zero, limit = float32(1), float32(0), float32(1 - 1e-6)
     length = (leave - enter) / unit
-    if y < zero:
-        return enter - unit * (one / (one + max(y, -limit)) - one)
-    if y > length:
-        return leave + unit * (one / (one - min(y - length, limit)) - one)
-    return enter + unit * y
+    before = enter - unit * (one / (one + max(min(y, zero), -limit)) - one)
+    beyond = leave + unit * (one / (one - min(max(y - length, zero), limit)) - one)
+    return before if y < zero else (beyond if y > length else enter + unit * y)  # without branches, for vector code
 
 
 @jit(forceinline=True)

@@ -8,7 +8,7 @@ import numpy as np
 from numba import float32, prange
 
 from nerf_lightning.kernels.cpu.jit import jit, kernel
-from nerf_lightning.kernels.cpu.simd import MAX_LANES, broadcast, fma, horizontal_sum, load, prefetch, store
+from nerf_lightning.kernels.cpu.simd import MAX_LANES, broadcast, fma, horizontal_sum, load, prefetch, rectify, store
 
 TILE = 128
 """Samples per tile; a constant, so that the inner loops need no remainder."""
@@ -19,16 +19,15 @@ LANES = (0,) * MAX_LANES
 
 
 @jit
-def add_product(W, x, y):
-    """y += W x in blocks of four rows by two registers of samples: eight independent sums hide the latency."""
+def affine(W, b, x, y, relu):
+    """y = W x + b, or its ReLU, in blocks of four rows by two registers of samples: eight independent sums hide the latency."""
     outputs, inputs = W.shape
     half = len(LANES)
     for n in range(0, TILE, 2 * half):
         for o in range(0, outputs, 4):
-            a0, a1 = load(y, o, n, LANES), load(y, o, n + half, LANES)
-            b0, b1 = load(y, o + 1, n, LANES), load(y, o + 1, n + half, LANES)
-            c0, c1 = load(y, o + 2, n, LANES), load(y, o + 2, n + half, LANES)
-            d0, d1 = load(y, o + 3, n, LANES), load(y, o + 3, n + half, LANES)
+            a0, b0 = broadcast(b[o], LANES), broadcast(b[o + 1], LANES)
+            c0, d0 = broadcast(b[o + 2], LANES), broadcast(b[o + 3], LANES)
+            a1, b1, c1, d1 = a0, b0, c0, d0
             for i in range(inputs):
                 x0, x1 = load(x, i, n, LANES), load(x, i, n + half, LANES)
                 w = broadcast(W[o, i], LANES)
@@ -40,28 +39,8 @@ def add_product(W, x, y):
                 w = broadcast(W[o + 3, i], LANES)
                 d0, d1 = fma(w, x0, d0), fma(w, x1, d1)
             for k, sums in enumerate(((a0, a1), (b0, b1), (c0, c1), (d0, d1))):
-                store(y, o + k, n, sums[0])
-                store(y, o + k, n + half, sums[1])
-
-
-@jit
-def affine(W, b, x, y, relu):
-    """y = W x + b, or its ReLU."""
-    for o in range(len(W)):
-        for n in range(TILE):
-            y[o, n] = b[o]
-    add_product(W, x, y)
-    if relu:
-        for o in range(len(W)):
-            for n in range(TILE):
-                y[o, n] = float32(0) if y[o, n] < float32(0) else y[o, n]  # keeps NaN
-
-
-@jit
-def input_gradient(W, dy, dx):
-    """dx = W^T dy."""
-    dx[:] = float32(0)
-    add_product(W.T, dy, dx)
+                store(y, o + k, n, rectify(sums[0]) if relu else sums[0])
+                store(y, o + k, n + half, rectify(sums[1]) if relu else sums[1])
 
 
 @jit
@@ -163,7 +142,7 @@ def backward(weights, widths, x, extra, grad_output, grad_x, grad_weights, worke
         activations = np.empty((widths.sum(), TILE_STRIDE), np.float32)
         grad_out = np.empty((widths.max(), TILE_STRIDE), np.float32)
         grad_in = np.empty((widths.max(), TILE_STRIDE), np.float32)
-        sums = grad_weights[worker]
+        sums, no_bias = grad_weights[worker], np.zeros(widths.max(), np.float32)
         sums[:] = float32(0)
         for tile in range(tiles * worker // workers, tiles * (worker + 1) // workers):
             first = tile * TILE
@@ -179,7 +158,7 @@ def backward(weights, widths, x, extra, grad_output, grad_x, grad_weights, worke
                 grad_matrix, grad_bias = layer_parameters(sums, start, inputs, outputs)
                 layer_input = activations[row : row + inputs]
                 add_weight_gradient(grad_matrix, grad_bias, grad_out[:outputs], layer_input)
-                input_gradient(matrix, grad_out[:outputs], grad_in[:inputs])
+                affine(matrix.T, no_bias, grad_out[:outputs], grad_in[:inputs], False)
                 if index > 0:
                     for i in range(inputs):
                         for n in range(TILE):

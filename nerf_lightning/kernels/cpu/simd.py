@@ -133,6 +133,91 @@ def fma(typing, a, b, c):
 
 
 @intrinsic
+def rectify(typing, a):
+    """ReLU of every lane; keeps NaN."""
+
+    def code(context, builder, signature, values):
+        zero = ir.Constant(values[0].type, [0.0] * a.width)
+        return builder.select(builder.fcmp_ordered("<", values[0], zero), zero, values[0])
+
+    return a(a), code
+
+
+@intrinsic
+def interpolate_lanes(typing, table, unit, first, cells, factors, mask, out, features, hashed, lanes):
+    """Trilinear interpolation: fills out[:, n] for the n of first : first + len(lanes), rounded as in scalar code.
+
+    Args:
+        table, unit, out: [T, F], [3, N] and [F, N], F = len(features); pairs of features are gathered as one double.
+        cells: cells along the three axes; int32, as `factors` and `mask`.
+        factors: factor of each coordinate in a vertex's row. The products are added; with `hashed`, a tuple, not empty,
+            they are combined by XOR and masked.
+    """
+    width, pack, hashes = len(lanes), 2 - len(features) % 2, len(hashed) > 0
+    element = ir.DoubleType() if pack == 2 else ir.FloatType()
+    vector, packed = ir.VectorType(ir.FloatType(), width), ir.VectorType(ir.FloatType(), pack * width)
+    whole, bits = ir.VectorType(ir.IntType(32), width), ir.VectorType(ir.IntType(1), width)
+    places, loaded = ir.VectorType(element.as_pointer(), width), ir.VectorType(element, width)
+    row = ir.ArrayType(element, len(features) // pack)
+
+    def code(context, builder, signature, values):
+        kinds, number = signature.args, ir.IntType(32)
+        name = f"llvm.masked.gather.v{width}f{32 * pack}.v{width}p0"
+        gather = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(loaded, [places, number, bits, loaded]), name
+        )
+        base = builder.bitcast(context.make_array(kinds[0])(context, builder, values[0]).data, row.as_pointer())
+
+        def splat(value):
+            empty = ir.Constant(ir.VectorType(value.type, width), ir.Undefined)
+            return _shuffle(builder, builder.insert_element(empty, value, number(0)), empty, [0] * width)
+
+        def entry(index, column):
+            place = builder.gep(base, [index, number(column)], source_etype=row)
+            place.type = places  # llvmlite takes the scalar's
+            arguments = place, number(4), ir.Constant(bits, [1] * width), ir.Constant(loaded, ir.Undefined)
+            return builder.bitcast(builder.call(gather, arguments), packed)
+
+        zero, one, corners = ir.Constant(vector, [0.0] * width), ir.Constant(vector, [1.0] * width), [(None, None)]
+        for axis in range(3):
+            sides, factor = (splat(builder.extract_value(values[i], axis)) for i in (3, 4))
+            where = (kinds[1], types.intp, kinds[2]), (values[1], ir.IntType(64)(axis), values[2])
+            x = builder.load(_pointer(context, builder, *where, width), align=4)
+            x = builder.select(builder.fcmp_ordered("<", x, zero), zero, x)  # keeps NaN
+            x = builder.select(builder.fcmp_ordered(">", x, one), one, x)
+            scaled, last = (
+                builder.fmul(x, builder.sitofp(sides, vector)),
+                builder.sub(sides, ir.Constant(whole, [1] * width)),
+            )
+            cell = builder.fptosi(scaled, whole)
+            cell = builder.select(builder.icmp_unsigned("<", cell, last), cell, last)
+            fraction, low = builder.fsub(scaled, builder.sitofp(cell, vector)), builder.mul(cell, factor)
+            ends = (low, builder.fsub(one, fraction)), (builder.add(low, factor), fraction)
+            combine = builder.xor if hashes else builder.add
+            corners = [
+                end if index is None else (combine(index, end[0]), builder.fmul(weight, end[1]))
+                for index, weight in corners
+                for end in ends
+            ]
+        if hashes:
+            corners = [(builder.and_(index, splat(values[5])), weight) for index, weight in corners]
+        repeated = [lane // pack for lane in range(pack * width)]
+        weights = [_shuffle(builder, weight, weight, repeated) for _, weight in corners]
+        for column in range(len(features) // pack):
+            terms = [builder.fmul(w, entry(index, column)) for (index, _), w in zip(corners, weights, strict=True)]
+            while len(terms) > 1:
+                terms = [builder.fadd(*pair) for pair in zip(terms[::2], terms[1::2], strict=True)]
+            for part in range(pack):
+                number_of_row = ir.IntType(64)(pack * column + part)
+                where = (kinds[6], types.intp, kinds[2]), (values[6], number_of_row, values[2])
+                value = _shuffle(builder, terms[0], terms[0], range(part, pack * width, pack))
+                builder.store(value, _pointer(context, builder, *where, width), align=4)
+        return context.get_dummy_value()
+
+    return types.none(table, unit, first, cells, factors, mask, out, features, hashed, lanes), code
+
+
+@intrinsic
 def transpose(typing, source, row, column, target, to_row, to_column, lanes):
     """Transposes a square: target[to_row + j, to_column + i] = source[row + i, column + j] for i, j < len(lanes) = 2^n."""
     width = len(lanes)

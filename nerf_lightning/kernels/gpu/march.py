@@ -10,7 +10,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.kernels.gpu.launch import kernel
 
-RAYS_PER_PROGRAM, STEPS_PER_BLOCK = 4, 128
+RAYS_PER_PROGRAM, STEPS_PER_BLOCK = 4, 64
 BLOCK = 256
 """Samples per program."""
 

@@ -203,14 +203,15 @@ class MLP(torch.autograd.Function):
             for grad, width in zip(grads, widths, strict=True)
         ]
         _, inputs, extras, hidden, outputs, *_ = ctx.shape
-        grad_x, (h1, h2, g1, g2), g3 = torch.empty_like(x), x.new_empty(4, count, hidden), x.new_empty(count, outputs)
-        biases = x.new_zeros(2 * hidden + outputs)
+        grad_x, g3, biases = torch.empty_like(x), x.new_empty(count, outputs), x.new_zeros(2 * hidden + outputs)
+        h2, g1, *middle = x.new_empty(4 if ctx.constants["TWO"] else 2, count, hidden)
+        h1, g2 = middle or (biases, biases)  # not written with one hidden layer
         given = x, extra, *layers[:2], *layers[-4:-1], head, *above, grad_x, h1, h2, g1, g2, g3, biases
         differentiate((triton.cdiv(count, BLOCK),), *given, *ctx.shape, **ctx.constants)
         first = x.new_empty(hidden, inputs + extras)
         torch.mm(g1.T, x, out=first[:, :inputs])
         if extras:
             torch.mm(g1.T, extra, out=first[:, inputs:])
-        middle = [g2.T @ h1, biases[hidden : 2 * hidden]] if ctx.constants["TWO"] else []
-        gradients = first, biases[:hidden], *middle, g3.T @ h2, biases[2 * hidden :]
+        second = [g2.T @ h1, biases[hidden : 2 * hidden]] if middle else []
+        gradients = first, biases[:hidden], *second, g3.T @ h2, biases[2 * hidden :]
         return grad_x, None, None, None, None, *gradients

@@ -3,6 +3,7 @@
 import functools
 import logging
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -92,6 +93,10 @@ def make_checks(device: torch.device) -> dict[str, tuple[Callable[..., Any], lis
     colors, alpha, pixels = rand(2, NUM_RAYS, 3), rand(NUM_RAYS), (255 * rand(NUM_RAYS, 4)).byte()
     weights = rand(NUM_RAYS), rand(NUM_RAYS) < 0.5
     bits = rand(NUM_POSITIONS, 32).round()  # sums of products of few bits are exact in TF32
+    edges, shares, main = rand(NUM_RAYS, 25).sort(1).values, rand(NUM_RAYS, 24) + 0.1, rand(NUM_RAYS, 16) / 16
+    room = replace(bounds, unbounded=True)
+    exact = march_reference(rays, bounds, *limits[:-1])
+    penalties = exact, 0.5, (1.0, 1.0, 1.0), rand(NUM_RAYS)
     return {
         "march": (lambda: mask_padding(kernels.march(rays, bounds, *limits)), []),
         "filter_visible": (lambda: mask_padding(kernels.filter_visible(depth, packed, 1e-2, 0.02, CAPACITY)[1]), []),
@@ -108,6 +113,14 @@ def make_checks(device: torch.device) -> dict[str, tuple[Callable[..., Any], lis
         "hash_interpolate": (lambda a, b: [kernels.hash_interpolate(a, b, cells, sizes)], [rand(sum(sizes), 2), unit]),
         "plane_line_products": (lambda a, b: [kernels.plane_line_products(a, b, unit)], [planes, planes[:, 0]]),
         "mlp": (run_network, [bits[:, 16:], *(rand(*n).round() for n in ((32, 32), (32,), (8, 32), (8,)))]),
+        "interval_midpoints": (lambda: kernels.interval_midpoints(rays, room, *room.near_far(rays), edges), []),
+        "resample": (lambda: [kernels.resample(edges, shares, limits[0] - 0.5, 16)], []),
+        "proposal_weights": (lambda x: [kernels.proposal_weights(x, shares, -1.0, 0.5)], [rand(24 * NUM_RAYS, 2)]),
+        "interlevel_loss": (lambda x: [kernels.interlevel_loss(x, edges, edges[:, :17], main)], [shares / 40]),
+        "weight_losses": (
+            lambda a, b: kernels.weight_losses(a, b, *penalties).values(),
+            [rand(len(exact[0])), rand(len(exact[0]), 3)],
+        ),
     }
 
 
