@@ -8,7 +8,7 @@ import triton.language as tl
 from torch import Tensor
 
 from nerf_lightning.kernels.gpu.launch import kernel
-from nerf_lightning.kernels.gpu.march import index_free_slots, pad_buffers
+from nerf_lightning.kernels.gpu.march import find_free_slots, pad_buffers
 
 BLOCK = 32
 """Samples of a ray at a time: one per thread of a warp."""
@@ -80,8 +80,10 @@ def differentiate_rays(
         tl.store(grad_rgb + at + 2 * channel_stride, g2 * weight, is_sample)
         rest -= tl.sum(weight * value)
         depth += tl.sum(optical_depth)
-    for begin in range(0, tl.cdiv(samples, rays), B):
-        slot, is_free = index_free_slots(offsets, rays, samples, begin, B)
+    part, first_free = find_free_slots(offsets, rays, samples)
+    for begin in range(0, part, B):
+        slot = first_free + begin + tl.arange(0, B)
+        is_free = (begin + tl.arange(0, B) < part) & (slot < samples)
         tl.store(grad_density + slot, 0.0, is_free)
         for channel in tl.static_range(3):
             tl.store(grad_rgb + slot * stride + channel * channel_stride, 0.0, is_free)

@@ -39,23 +39,23 @@ def index_axis(position, axis, center, half_size, resolution):
 
 
 @triton.jit
-def index_free_slots(offsets, rays, capacity, first, S: tl.constexpr):
-    """Slots of a buffer beyond the last ray's, this program's part from its number `first` on; and which of them exist."""
+def find_free_slots(offsets, rays, capacity):
+    """This program's part of the slots of a buffer beyond the last ray's: their number, and the first."""
     part = tl.cdiv(capacity, tl.num_programs(0))
-    i = first + tl.arange(0, S)
-    slot = tl.load(offsets + rays).to(tl.int32) + tl.program_id(0) * part + i
-    return slot, (i < part) & (slot < capacity)
+    return part, tl.load(offsets + rays).to(tl.int32) + tl.program_id(0) * part
 
 
 @triton.jit
 def pad_buffers(depth_out, t_out, dt_out, ray_out, offsets, rays, capacity, S: tl.constexpr):
     """Fills this program's part of the unused slots with intervals of length 0 on the last ray."""
-    for first in range(0, tl.cdiv(capacity, tl.num_programs(0)), S):
-        slot, is_free = index_free_slots(offsets, rays, capacity, first, S)
-        tl.store(depth_out + slot, 0.0, is_free)
-        tl.store(t_out + slot, 0.0, is_free)
-        tl.store(dt_out + slot, 0.0, is_free)
-        tl.store(ray_out + slot, tl.zeros([S], tl.int64) + rays - 1, is_free)
+    part, begin = find_free_slots(offsets, rays, capacity)
+    for first in range(0, part, S):
+        i = first + tl.arange(0, S)
+        is_free = (i < part) & (begin + i < capacity)
+        tl.store(depth_out + begin + i, 0.0, is_free)
+        tl.store(t_out + begin + i, 0.0, is_free)
+        tl.store(dt_out + begin + i, 0.0, is_free)
+        tl.store(ray_out + begin + i, tl.zeros([S], tl.int64) + rays - 1, is_free)
 
 
 @kernel()
