@@ -156,6 +156,8 @@ def test_training_step_on_gpu_kernels_needs_few_launches(
         set_kernels("auto")
     assert 20 < count.operations <= MAX_LAUNCHES[name], count.names
     assert not count.waits
+
+
 def test_capture_training_on_gpu_kernels_matches_reference(launched: list[str], tmp_path: Path):
     proposals = ["sampler=proposal", "sampler.samples=5", "sampler.coarse_samples=9", "sampler.fine_samples=6"]
     losses = {}
