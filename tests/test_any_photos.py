@@ -79,7 +79,7 @@ def test_run_nan_renders_is_collapsed(folder: Path, tmp_path: Path, monkeypatch:
     def render_badly(self: NeRF3D, *given: Any) -> RenderOutput:
         rendered = render_well(self, *given)
         self.corrections.poses.pose_adjustment.data.fill_(torch.nan)
-        return replace(rendered, rgb=rendered.rgb * torch.nan)
+        return replace(rendered, foreground=rendered.rgb * torch.nan, backgrounds=None)
 
     options = ["callbacks.snapshots=null", "callbacks.orbit=null", "callbacks.validation.fractions=[0.5]", "~logger"]
     options += ["refine=both", *SMALL_SAMPLER]

@@ -83,7 +83,8 @@ class DivergenceRecovery(L.Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: System) -> None:
         with Budget.find(trainer).pause():
-            truth = pl_module.compute_target_rgb(get_datamodule(trainer).make_baseline_batch().to(pl_module.device))
+            batch = get_datamodule(trainer).make_baseline_batch().to(pl_module.device)
+            truth = pl_module.compute_target_rgb(batch, is_training=True)
             self.monitor.constant_color_loss = float((truth - truth.mean(0)).square().mean())
         if self.max_restarts and self.monitor.is_healthy and is_finite(pl_module):
             self._good_state = copy_state(pl_module)  # of a resumed run

@@ -26,6 +26,18 @@ def mean_squared_error(
     return (squared_errors if weights is None else squared_errors * weights).mean(), squared_errors
 
 
+def opacity_loss(
+    opacity: Tensor, pixels: Tensor, variance: float, weights: Tensor | None, complete: Tensor | None
+) -> tuple[Float[Tensor, ""], Float[Tensor, "R"]]:
+    """What random backgrounds of a variance add to `photometric_loss` on their mean.
+
+    A channel's error on a background b is e + (alpha - opacity) * (b - mean): its expected square adds the variance of b times
+    the squared error of the opacity. This mean over all colors has less noise than one color per ray.
+    """
+    loss, squared_errors = mean_squared_error(opacity[:, None], pixels[:, 3:] / 255, weights, complete)
+    return variance * loss, variance * squared_errors
+
+
 def photometric_loss(
     foreground: Float[Tensor, "R 3"],
     opacity: Float[Tensor, "R"],
@@ -33,17 +45,25 @@ def photometric_loss(
     pixels: UInt8[Tensor, "R C"],
     weights: Float[Tensor, "R"] | None = None,
     complete: Bool[Tensor, "R"] | None = None,
-) -> tuple[Float[Tensor, ""], Float[Tensor, "R"]]:
-    """Weighted mean of the squared errors of rendered rays against photo pixels, and each ray's (the mean of its channels).
+    variance: float = 0.0,
+) -> tuple[Float[Tensor, ""], Float[Tensor, ""] | None, Float[Tensor, "R"]]:
+    """Weighted mean of the squared errors of rendered rays against photo pixels, that of the opacity, and each ray's sum of both.
 
     Args:
         foreground, opacity: color without background, and opacity.
         pixels: see `composite_over`.
         weights: weight of each ray.
         complete: rays that have all their samples; the others have no error.
+        variance: of the backgrounds' channels, where they are random with mean `backgrounds`; 0: no error of the opacity.
     """
     constants = (backgrounds,) if weights is None else (backgrounds, weights)
     if has_gpu_kernel(foreground, opacity, constants=constants):
-        return gpu.composite.PhotometricLoss.apply(foreground, opacity, backgrounds, pixels, weights, complete)
+        arguments = foreground, opacity, backgrounds, pixels, weights, complete, variance
+        loss, on_opacity, squared_errors = gpu.composite.PhotometricLoss.apply(*arguments)
+        return loss, on_opacity if variance else None, squared_errors
     rgb = torch.addcmul(foreground, (1 - opacity)[:, None], backgrounds)
-    return mean_squared_error(rgb, composite_over(pixels, backgrounds), weights, complete)
+    loss, squared_errors = mean_squared_error(rgb, composite_over(pixels, backgrounds), weights, complete)
+    if not variance:
+        return loss, None, squared_errors
+    on_opacity, opacity_errors = opacity_loss(opacity, pixels, variance, weights, complete)
+    return loss, on_opacity, squared_errors + opacity_errors

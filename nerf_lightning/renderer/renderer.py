@@ -82,7 +82,7 @@ class VolumeRenderer(torch.nn.Module):
 
     def __init__(
         self,
-        background: str | list[float] = "scene",
+        background: str | list[float] = "auto",
         scene_background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         distortion_loss_weight: LossWeight = 0.0,
         near_loss_weight: LossWeight = 0.0,

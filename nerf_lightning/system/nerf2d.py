@@ -36,7 +36,7 @@ class NeRF2D(System):
     def compute_losses(self, batch: PixelBatch, generator: torch.Generator) -> tuple[dict[str, Tensor], StepStats]:
         return {"photometric": self.loss(batch)}, self.stats
 
-    def compute_target_rgb(self, batch: PixelBatch) -> Tensor:
+    def compute_target_rgb(self, batch: PixelBatch, is_training: bool = False) -> Tensor:
         return batch.rgb
 
     def render_view(self, view: PictureBatch) -> tuple[Tensor, None, None]:

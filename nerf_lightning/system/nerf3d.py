@@ -12,12 +12,11 @@ from torch import Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.dataset.ray_datamodule import STEPS_PER_DRAW
-from nerf_lightning.kernels import mean_squared_error, photometric_loss
+from nerf_lightning.kernels import mean_squared_error, opacity_loss, photometric_loss
 from nerf_lightning.kernels.backend import get_kernels
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
 from nerf_lightning.renderer import RenderOutput, VolumeRenderer, composite_over
-from nerf_lightning.renderer.background import opacity_loss
 from nerf_lightning.sampler import CHUNK, Sampler, Samples, split_by_rays
 from nerf_lightning.system.correction_trial import CorrectionTrials
 from nerf_lightning.system.growth import FieldGrowth, sync_resolution_scale
@@ -156,19 +155,21 @@ class NeRF3D(System):
             samples = self.sampler(rays.detach(), self.field.density, generator)
         backgrounds = self.renderer.background.expand(len(rays), is_training=True)
         output = self.renderer(rays, samples, self.field, backgrounds)
-        weights = batch.weights, samples.complete
+        weights, variance, on_opacity = (batch.weights, samples.complete), self.renderer.background.variance, None
         if self.corrections is None:
-            pixels = backgrounds, batch.pixels
-            loss, squared_errors = photometric_loss(output.foreground, output.opacity, *pixels, *weights)
+            colors = output.foreground, output.opacity, backgrounds, batch.pixels
+            loss, on_opacity, squared_errors = photometric_loss(*colors, *weights, variance)
         else:
             assert batch.views is not None
             truth = composite_over(batch.pixels, backgrounds)
             rgb = self.corrections.color(output.rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
             loss, squared_errors = mean_squared_error(rgb, truth, *weights)
+            if variance:
+                on_opacity, opacity_errors = opacity_loss(output.opacity, batch.pixels, variance, *weights)
+                squared_errors = squared_errors + opacity_errors
         losses = {"photometric": loss, **self.regularize(output, samples, batch)}
-        if self.renderer.background.is_random:
-            losses["opacity"], opacity_errors = opacity_loss(output.opacity, batch.pixels, *weights)
-            squared_errors = squared_errors + opacity_errors
+        if on_opacity is not None:
+            losses["opacity"] = on_opacity
         per_ray = self.sampler.samples_per_ray
         stats = StepStats(
             losses["photometric"].detach(),
@@ -258,8 +259,8 @@ class NeRF3D(System):
     def background(self) -> list[float]:
         return [round(c, 3) for c in self.renderer.background.color.tolist()]
 
-    def compute_target_rgb(self, batch: RayBatch) -> Tensor:
-        return composite_over(batch.pixels, self.renderer.background.expand(len(batch.rays)))
+    def compute_target_rgb(self, batch: RayBatch, is_training: bool = False) -> Tensor:
+        return composite_over(batch.pixels, self.renderer.background.expand(len(batch.rays), is_training))
 
     def render_view(self, view: ViewBatch) -> tuple[Tensor, Tensor, Tensor]:
         rendered = self.render(view.rays)

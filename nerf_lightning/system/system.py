@@ -194,8 +194,8 @@ class System(L.LightningModule):
     def restart(self, step: int) -> None:
         """Called when training restarts at `step` with fresh weights."""
 
-    def compute_target_rgb(self, batch: Any) -> Float[Tensor, "N 3"]:
-        """Target colors of an evaluation batch."""
+    def compute_target_rgb(self, batch: Any, is_training: bool = False) -> Float[Tensor, "N 3"]:
+        """Target colors of a batch: in evaluation, or as training steps see them."""
         raise TypeError(f"{type(self).__name__} must define compute_target_rgb(batch)")
 
     def render_view(

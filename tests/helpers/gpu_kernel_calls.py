@@ -79,11 +79,11 @@ def compare_colors(num_rays: int, channels: int, has_weights: bool, is_partial: 
     complete, foreground = torch.rand(num_rays) < 0.7, torch.rand(3, num_rays)
     foreground[1, ~complete] = math.nan
     background = torch.rand(num_rays, 3) if is_partial else torch.rand(3).expand(num_rays, 3)
-    options = weights if has_weights else None, complete if is_partial else None
+    options, variance = (weights if has_weights else None, complete if is_partial else None), (channels - 3) / 12
 
     def call(foreground: Any, opacity: Any) -> Any:
-        loss, errors = kernels.photometric_loss(foreground.T, opacity, background, pixels, *options)
-        return [loss, errors.detach()]
+        *losses, errors = kernels.photometric_loss(foreground.T, opacity, background, pixels, *options, variance)
+        return [*(loss for loss in losses if loss is not None), errors.detach()]
 
     return call, [foreground if is_partial else foreground.nan_to_num(), torch.rand(num_rays)], ()
 

@@ -4,9 +4,9 @@ from torch import Generator, Tensor
 
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import photometric_loss
 from nerf_lightning.model import FieldOutput, HashGridField
 from nerf_lightning.renderer import VolumeRenderer, composite_over, renderer
-from nerf_lightning.renderer.background import opacity_loss
 from nerf_lightning.sampler import ProposalSampler, UniformSampler
 from tests.helpers.ragged_samples import make_ragged_samples
 
@@ -91,8 +91,11 @@ def test_background_random_is_mean_over_colors():
 
     expected = measure_errors(torch.rand(200_000, 3, generator=Generator().manual_seed(0))).mean()
     gray = measure_errors(background.expand(1, is_training=True))[0]
-    torch.testing.assert_close(gray + opacity_loss(opacity, pixels, None, None)[0], expected, rtol=1e-2, atol=0.0)
-    assert gray < 0.9 * expected and opacity_loss(opacity, pixels, None, torch.tensor([False]))[0] == 0
+    rendered = premultiplied, opacity, background.expand(1, is_training=True), pixels, None
+    loss, on_opacity, errors = photometric_loss(*rendered, None, background.variance)
+    assert loss == gray < 0.9 * expected and errors[0] == loss + on_opacity
+    torch.testing.assert_close(errors[0], expected, rtol=1e-2, atol=0.0)
+    assert not photometric_loss(*rendered, torch.tensor([False]), background.variance)[1]
 
 
 @pytest.mark.parametrize("background", ["green", [0.1, 0.2, 0.3, 0.4], [0, 0, 1.5]])

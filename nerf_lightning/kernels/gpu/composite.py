@@ -189,21 +189,23 @@ def filter_visible(
 @kernel()
 def compare_colors(
     foreground, opacity, backgrounds, pixels, weights, complete, errors, losses, gradients, rays, stride, channel_stride,
-    background_stride, background_channel_stride,
+    background_stride, background_channel_stride, variance,
     CHANNELS: tl.constexpr, HAS_WEIGHTS: tl.constexpr, IS_PARTIAL: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """Squared error and weighted error of each ray; gradients of the mean weighted error, [4, R]: foreground and opacity."""
+    """Squared error of each ray, and its weighted errors [2, R] of color and opacity; gradients of their means [5, R] with
+    respect to foreground and opacity, and to opacity alone."""
     ray = tl.program_id(0) * B + tl.arange(0, B)
     is_ray = ray < rays
-    transparency = 1 - tl.load(opacity + ray, is_ray, 0.0)
+    alpha, transparency = tl.full([B], 1.0, tl.float32), 1 - tl.load(opacity + ray, is_ray, 0.0)
+    if CHANNELS == 4:
+        alpha = tl.load(pixels + ray * 4 + 3, is_ray, 0).to(tl.float32) / 255
     weight = tl.load(weights + ray, is_ray, 0.0) if HAS_WEIGHTS else tl.full([B], 1.0, tl.float32)
     is_complete = tl.load(complete + ray, is_ray, 0) != 0 if IS_PARTIAL else is_ray
     error, behind = tl.zeros([B], tl.float32), tl.zeros([B], tl.float32)
     for channel in tl.static_range(3):
         background = tl.load(backgrounds + ray * background_stride + channel * background_channel_stride, is_ray, 0.0)
         truth = tl.load(pixels + ray * CHANNELS + channel, is_ray, 0).to(tl.float32) / 255
-        if CHANNELS == 4:
-            truth = background + (truth - background) * tl.load(pixels + ray * 4 + 3, is_ray, 0).to(tl.float32) / 255
+        truth = background + (truth - background) * alpha
         color = tl.load(foreground + ray * stride + channel * channel_stride, is_ray, 0.0)
         difference = tl.where(is_complete, color + transparency * background - truth, 0.0)
         slope = difference * weight * (2 / 3) / rays
@@ -211,8 +213,11 @@ def compare_colors(
         error += difference * difference / 3
         behind += slope * background
     tl.store(gradients + 3 * rays + ray, -behind, is_ray)
-    tl.store(errors + ray, error, is_ray)
+    excess = tl.where(is_complete, 1 - transparency - alpha, 0.0)
+    tl.store(gradients + 4 * rays + ray, excess * weight * (2 * variance) / rays, is_ray)
+    tl.store(errors + ray, error + variance * excess * excess, is_ray)
     tl.store(losses + ray, error * weight, is_ray)
+    tl.store(losses + rays + ray, variance * excess * excess * weight, is_ray)
 
 
 class PhotometricLoss(torch.autograd.Function):
@@ -221,13 +226,13 @@ class PhotometricLoss(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx, foreground: Tensor, opacity: Tensor, backgrounds: Tensor, pixels: Tensor, weights: Tensor | None,
-        complete: Tensor | None,
+        complete: Tensor | None, variance: float,
     ):  # fmt: skip
         rays, channels = pixels.shape
-        (errors, losses), gradients = opacity.new_empty(2, rays).unbind(), opacity.new_empty(4, rays)
+        errors, losses, gradients = (opacity.new_empty(size) for size in ((rays,), (2, rays), (5, rays)))
         given = foreground, opacity.contiguous(), backgrounds, pixels.contiguous()
         masks = errors if weights is None else weights.contiguous(), pixels if complete is None else complete
-        shape = rays, *foreground.stride(), *backgrounds.stride()
+        shape = rays, *foreground.stride(), *backgrounds.stride(), variance
         constants = {"CHANNELS": channels, "HAS_WEIGHTS": weights is not None, "IS_PARTIAL": complete is not None}
         compare_colors(
             (triton.cdiv(rays, RAYS),), *given, *masks, errors, losses, gradients, *shape, **constants, B=RAYS
@@ -235,9 +240,13 @@ class PhotometricLoss(torch.autograd.Function):
         ctx.save_for_backward(gradients)
         ctx.mark_non_differentiable(errors)
         ctx.set_materialize_grads(False)
-        return losses.mean(), errors
+        return *losses.mean(1).unbind(), errors
 
     @staticmethod
-    def backward(ctx, grad: Tensor | None, _: None):
-        gradients = ctx.saved_tensors[0] * grad
-        return gradients[:3].T, gradients[3], None, None, None, None
+    def backward(ctx, grad: Tensor | None, grad_opacity: Tensor | None, _: None):
+        (*_, for_opacity), gradients = ctx.saved_tensors[0], ctx.saved_tensors[0][:4]
+        if grad is not None:
+            gradients = gradients * grad
+        if grad_opacity is not None:
+            gradients[3].add_(for_opacity * grad_opacity)
+        return gradients[:3].T, gradients[3], None, None, None, None, None

@@ -107,7 +107,7 @@ def make_checks(device: torch.device) -> dict[str, tuple[Callable[..., Any], lis
             [20 * rand(CAPACITY), rand(CAPACITY, 3)],
         ),
         "photometric_loss": (
-            lambda a, b: kernels.photometric_loss(a, b, colors[0], pixels, *weights)[:1],
+            lambda a, b: kernels.photometric_loss(a, b, colors[0], pixels, *weights, 0.1)[:2],
             [*colors[1:], alpha],
         ),
         "hash_interpolate": (lambda a, b: [kernels.hash_interpolate(a, b, cells, sizes)], [rand(sum(sizes), 2), unit]),
