@@ -47,7 +47,7 @@ def photometric_loss(
     complete: Bool[Tensor, "R"] | None = None,
     variance: float = 0.0,
 ) -> tuple[Float[Tensor, ""], Float[Tensor, ""] | None, Float[Tensor, "R"]]:
-    """Weighted mean of the squared errors of rendered rays against photo pixels, that of the opacity, and each ray's sum of both.
+    """Weighted mean squared error of rendered rays against photo pixels, that of their opacity, and each ray's sum of both.
 
     Args:
         foreground, opacity: color without background, and opacity.

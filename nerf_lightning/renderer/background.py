@@ -27,6 +27,7 @@ class Background(torch.nn.Module):
     """
 
     color: Tensor
+    training_color: Tensor
 
     def __init__(self, choice: str | list[float], scene_color: tuple[float, float, float], has_alpha: bool):
         super().__init__()
@@ -39,7 +40,9 @@ class Background(torch.nn.Module):
         if len(color) != 3 or not all(0 <= c <= 1 for c in color):
             expected = f"{', '.join([*SCENE_CHOICES, *COLORS])} or three numbers in [0, 1]"
             raise InputError("renderer.background", "", repr(choice), expected)
+        training_color = [RANDOM_MEAN] * 3 if self.is_random else color
         self.register_buffer("color", torch.tensor(color), persistent=False)
+        self.register_buffer("training_color", torch.tensor(training_color), persistent=False)
 
     @property
     def variance(self) -> float:
@@ -48,6 +51,4 @@ class Background(torch.nn.Module):
 
     def expand(self, count: int, is_training: bool = False) -> Float[Tensor, "R 3"]:
         """Background colors of `count` rays; in training the mean of random ones."""
-        if self.is_random and is_training:
-            return torch.full((count, 3), RANDOM_MEAN, device=self.color.device)
-        return self.color.expand(count, 3)
+        return (self.training_color if is_training else self.color).expand(count, 3)

@@ -191,7 +191,9 @@ def proposals(draw: DRAW) -> Case:
     if draw(st.booleans()):
         return Case(lambda: k.interval_midpoints(rays, bounds, *bounds.near_far(rays), s), [], rtol=0, atol=0)
     share, shift = torch.rand(50, 12) * (torch.rand(50, 1) < 0.8), torch.rand(50) - 0.5
-    return Case(lambda: k.resample(s, share, shift, 20), [], atol=1e-3)  # rounding moves edges in intervals of little weight
+    return Case(
+        lambda: k.resample(s, share, shift, 20), [], atol=1e-3
+    )  # rounding moves edges in intervals of little weight
 
 
 LEARNING = [composite, spherical_harmonics, hash_interpolate, mlp, planes, ray_positions, voxels]
