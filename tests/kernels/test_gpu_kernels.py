@@ -96,6 +96,10 @@ def test_self_test_finds_wrong_or_failing_kernel(monkeypatch: pytest.MonkeyPatch
     assert self_test.find_failure(torch.device("cpu")) == "march: ZeroDivisionError: division by zero"
 
 
+NUM_STEPS = [4, pytest.param(20, marks=pytest.mark.long)]
+
+
+@pytest.mark.parametrize("steps", NUM_STEPS)
 @pytest.mark.parametrize(
     ("recipe", "model"),
     [
@@ -103,7 +107,9 @@ def test_self_test_finds_wrong_or_failing_kernel(monkeypatch: pytest.MonkeyPatch
         ("tensorf_small", ["model.base_resolution=12", "model.max_resolution=20"]),
     ],
 )
-def test_training_on_gpu_kernels_matches_reference(recipe: str, model: list[str], launched: list[str], tmp_path: Path):
+def test_training_on_gpu_kernels_matches_reference(
+    recipe: str, model: list[str], steps: int, launched: list[str], tmp_path: Path
+):
     small = [
         "dataset=bricks",
         "dataset.size=24",
@@ -112,15 +118,15 @@ def test_training_on_gpu_kernels_matches_reference(recipe: str, model: list[str]
         "dataset.samples=null",
     ]
     options = [f"recipe={recipe}", *model, *small, "dataset.rays=6", "sampler.resolution=8", "+sampler.samples=24"]
-    losses = {}
+    losses: dict[str, list[float]] = {}
     for choice in ("reference", "triton"):
         torch.manual_seed(0)
         set_kernels("auto")
         system, data = build_system_and_data(options, tmp_path)
         set_kernels(choice)
-        losses[choice] = train_steps(system, data, 20, torch.device("cpu"))
+        losses[choice] = train_steps(system, data, steps, torch.device("cpu"))
     assert losses["triton"] == pytest.approx(losses["reference"], rel=1e-5)
-    assert launched.count("composite.differentiate_rays") == 20
+    assert launched.count("composite.differentiate_rays") == steps
 
 
 MAX_LAUNCHES = {"hashgrid": 45, "tensorf": 41}
@@ -158,16 +164,17 @@ def test_training_step_on_gpu_kernels_needs_few_launches(
     assert not count.waits
 
 
-def test_capture_training_on_gpu_kernels_matches_reference(launched: list[str], tmp_path: Path):
+@pytest.mark.parametrize("steps", NUM_STEPS)
+def test_capture_training_on_gpu_kernels_matches_reference(steps: int, launched: list[str], tmp_path: Path):
     proposals = ["sampler=proposal", "sampler.samples=5", "sampler.coarse_samples=9", "sampler.fine_samples=6"]
     losses = {}
     for choice in ("reference", "triton"):
         torch.manual_seed(0)
         system, data = build_capture([*proposals, *SMALL_GRID, "optimizer.lr=0.003"], 2, tmp_path)
         set_kernels(choice)
-        losses[choice] = train_steps(system, data, 20, torch.device("cpu"))
+        losses[choice] = train_steps(system, data, steps, torch.device("cpu"))
     assert losses["triton"] == pytest.approx(losses["reference"], rel=1e-5)
-    assert launched.count("resampling.bound_weights") == 40
+    assert launched.count("resampling.bound_weights") == 2 * steps
 
 
 SMALL_GRID = ["model.num_levels=2", "model.max_resolution=32", "model.log2_hashmap_size=8"]
