@@ -33,7 +33,7 @@ from nerf_lightning.utils.seeding import Stream, step_generator
 from nerf_lightning.view.progressive import ProgressiveRenderer, ViewRequest
 from tests.helpers.fake_device import NAME, PretendModule
 from tests.helpers.growth import grow
-from tests.helpers.train_models import MODELS, SCENE
+from tests.helpers.train_models import MODELS, SCENE, SMALL_BRICKS
 
 SCENES = ("hashgrid", "voxels", "tensorf", "mlp")
 ON_DEVICE = ("device=pretend", "+trainer.inference_mode=false", "~logger")
@@ -124,7 +124,7 @@ MAX_OPERATIONS = {"tensorf": 271, "hashgrid": 270, "voxels": 273, "mlp": 242}
 )
 def test_training_step_on_device_needs_few_operations_and_no_wait(name: str, device: torch.device, tmp_path: Path):
     """With shipped settings, at the final field size; reading a result, or its size, makes the host wait."""
-    small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
+    small = SMALL_BRICKS
     system, data = build_system_and_data([f"recipe={name}_medium", *small, "sampler.warmup=0"], tmp_path)
     assert isinstance(system, NeRF3D)
     system, period, counts = system.to(device), system.sampler.update_every, []
@@ -169,13 +169,7 @@ def test_training_step_with_gpu_kernels_moves_few_bytes(recipe: str, device: tor
     """The kernels' outputs stay zeros: between two reads of the sample counts, sizes follow from rays and capacities."""
     pytest.importorskip("triton", "3.3", reason="the extra `test` installs triton on Linux")
     given, rays, counts, max_bytes = BYTES[recipe]
-    small = [
-        "dataset=bricks",
-        "dataset.size=24",
-        "dataset.train_views=8",
-        "dataset.val_views=1",
-        "dataset.samples=null",
-    ]
+    small = [*SMALL_BRICKS, "dataset.samples=null"]
     options = [f"recipe={recipe}", *given, *small, f"dataset.rays={rays}", "limits.chunk_samples=524288"]
     system, data = build_system_and_data(options, tmp_path)
     system.to(device).sampler.capacity.per_ray = {False: tuple(count / rays for count in counts)}

@@ -13,12 +13,11 @@ from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.dataset.ray_datamodule import make_batch
 from nerf_lightning.export.compress import MIN_OPACITY, CellMask, subsample_cameras
 from nerf_lightning.export.volume import MAX_RESOLUTION, MIN_RESOLUTION
-from nerf_lightning.kernels import volume_weights
+from nerf_lightning.kernels import cell_index, volume_weights
 from nerf_lightning.model import Field, HashGridField, TensoRFField, VoxelField
 from nerf_lightning.model.layers.encoding import encode_directions
 from nerf_lightning.model.layers.grid_masks import dilate, vertices_of_cells
 from nerf_lightning.model.voxels import EMPTY_LOG_DENSITY
-from nerf_lightning.renderer import composite_over
 from nerf_lightning.sampler import OccupancySampler
 from nerf_lightning.system import NeRF3D
 from nerf_lightning.utils.progress import track_progress
@@ -163,9 +162,7 @@ def find_weighty_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
             weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
             for end in (-0.5, 0.0, 0.5):  # an interval may cross cells
                 along = chunk.directions[samples.ray] * (samples.t + end * samples.dt)[:, None]
-                cell = (bounds.to_unit(chunk.origins[samples.ray] + along) * n).long().clamp(0, n - 1)
-                x, y, z = cell.unbind(1)
-                sums.index_add_(0, (x * n + y) * n + z, weights)
+                sums.index_add_(0, cell_index(bounds.to_unit(chunk.origins[samples.ray] + along), n), weights)
     ordered, order = sums.sort(descending=True)
     held = ordered.double().cumsum(0)
     mask = torch.zeros(n**3, dtype=torch.bool, device=system.device)
@@ -175,7 +172,7 @@ def find_weighty_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
 
 def polish(baked: NeRF3D, data: RayDataModule) -> None:
     """Trains a baked field on the photos, to recover detail between vertices."""
-    photos, color = data.scene.train, baked.renderer.background.color
+    photos = data.scene.train
     generator = torch.Generator().manual_seed(baked.seed)
     optimizer = torch.optim.Adam(baked.field.parameters(), POLISH_LR, (0.5, 0.99))
     for step in track_progress(range(POLISH_STEPS), POLISH_STEPS, "steps"):
@@ -184,8 +181,7 @@ def polish(baked: NeRF3D, data: RayDataModule) -> None:
         with torch.no_grad():
             samples = baked.sampler(batch.rays, baked.field.density, None)
         rendered = baked.renderer(batch.rays, samples, baked.field)
-        truth = composite_over(batch.pixels, color.expand(len(batch.pixels), 3))
-        loss = (rendered.rgb - truth).square().mean()
+        loss = (rendered.rgb - baked.compute_target_rgb(batch)).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

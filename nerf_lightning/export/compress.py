@@ -107,7 +107,7 @@ def measure_held_out_psnr(
         system: trained.
         data: of its run.
         views: indices of held-out views.
-        max_pixels: number of (evenly spaced) pixels over all views.
+        max_pixels: number of pixels over all views, of which a subset is taken.
     """
     chosen = range(data.num_held_out_views) if views is None else views
     subset = make_subset(sum(map(data.count_held_out_pixels, chosen)), max_pixels)

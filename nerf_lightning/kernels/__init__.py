@@ -12,7 +12,7 @@ from nerf_lightning.kernels.march import cell_index, march, mark_cells, pack_int
 from nerf_lightning.kernels.march_until_opaque import march_until_opaque
 from nerf_lightning.kernels.merge import average_neighbors, merge_low_weight
 from nerf_lightning.kernels.mlp import mlp, mlp_heads
-from nerf_lightning.kernels.photometric import composite_over, mean_squared_error, opacity_loss, photometric_loss
+from nerf_lightning.kernels.photometric import compare_colors, composite_over, photometric_loss
 from nerf_lightning.kernels.proposals import interlevel_loss, proposal_weights
 from nerf_lightning.kernels.resampling import interval_midpoints, invert_cdf, resample
 from nerf_lightning.kernels.vector_matrix import plane_line_products, plane_line_sum, plane_line_sum_and_products
@@ -34,6 +34,7 @@ __all__ = [
     "interval_weights",
     "cell_index",
     "composite",
+    "compare_colors",
     "composite_over",
     "march_until_opaque",
     "has_fast_kernel",
@@ -45,12 +46,10 @@ __all__ = [
     "march",
     "mark_cells",
     "mark_rows",
-    "mean_squared_error",
     "merge_low_weight",
     "mlp",
     "mlp_heads",
     "pack_intervals",
-    "opacity_loss",
     "photometric_loss",
     "plane_line_products",
     "plane_line_sum",

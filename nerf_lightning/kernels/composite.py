@@ -33,7 +33,7 @@ def volume_weights(
         dt: interval lengths, world units.
         ray: ray of each sample, ascending.
         offsets: first sample of each ray, then N.
-        per_ray: samples of each ray, if all have as many.
+        per_ray: number of samples of each ray, if all have the same.
 
     Returns:
         Weights in [0, 1]; their sum over a ray is its opacity.

@@ -13,7 +13,7 @@ _R3, _R5 = 3**0.5, 5**0.5
 _PLUS, _MINUS = (1.0, 1, 0, 0), (1.0, -1, 0, 0)
 _Z2, _Z3 = ((0, 0, _R5, -1.0), (0, 0, _R5, 1.0)), ((0, 0, _R5, -_R3), (0, 0, _R5, _R3))
 # On the unit sphere each function is a coefficient times three linear factors of (x, y, z, 1).
-FACTORS = (
+LINEAR_FACTORS = (
     (0.28209479177387814, _ONE, _ONE, _ONE),
     (-0.48860251190291987, _Y, _ONE, _ONE),
     (0.48860251190291987, _Z, _ONE, _ONE),
@@ -36,8 +36,8 @@ FACTORS = (
 @cache_constants
 def _factors(dtype: torch.dtype, device: torch.device) -> tuple[Float[Tensor, "48"], Float[Tensor, "3 48"]]:
     """Constants and matrix of all factors, those of a place in the product one after the other."""
-    scaled = [[c * first for first in first_factor] for c, first_factor, _, _ in FACTORS]
-    rows = [*scaled, *(row[place] for place in (2, 3) for row in FACTORS)]
+    scaled = [[c * first for first in first_factor] for c, first_factor, _, _ in LINEAR_FACTORS]
+    rows = [*scaled, *(row[place] for place in (2, 3) for row in LINEAR_FACTORS)]
     matrix = torch.tensor(rows, dtype=dtype, device=device)
     return matrix[:, 3].contiguous(), matrix[:, :3].T.contiguous()
 

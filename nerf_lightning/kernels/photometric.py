@@ -7,6 +7,9 @@ from torch import Tensor
 from nerf_lightning.kernels import gpu
 from nerf_lightning.kernels.backend import has_gpu_kernel
 
+PhotometricLosses = tuple[Float[Tensor, ""], Float[Tensor, ""] | None, Float[Tensor, "R"]]
+"""Weighted mean squared error of the colors, that of the opacity, and each ray's sum of both without its weight."""
+
 
 def composite_over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3"]) -> Float[Tensor, "R 3"]:
     """Composites photo pixels with straight alpha (C = 4) onto backgrounds; returns RGB in [0, 1]."""
@@ -16,26 +19,29 @@ def composite_over(pixels: UInt8[Tensor, "R C"], backgrounds: Float[Tensor, "R 3
     return torch.lerp(backgrounds, colors[:, :3], colors[:, 3:])
 
 
-def mean_squared_error(
-    rgb: Tensor, truth: Tensor, weights: Tensor | None, complete: Tensor | None
+def _mean_squared_error(
+    x: Tensor, truth: Tensor, weights: Tensor | None, complete: Tensor | None
 ) -> tuple[Float[Tensor, ""], Float[Tensor, "R"]]:
-    """`photometric_loss` of composited colors [R, 3]."""
     if complete is not None:  # truncated rays must not contribute
-        rgb = torch.where(complete[:, None], rgb, truth)
-    squared_errors = (rgb - truth).square().mean(1)
+        x = torch.where(complete[:, None], x, truth)
+    squared_errors = (x - truth).square().mean(1)
     return (squared_errors if weights is None else squared_errors * weights).mean(), squared_errors
 
 
-def opacity_loss(
-    opacity: Tensor, pixels: Tensor, variance: float, weights: Tensor | None, complete: Tensor | None
-) -> tuple[Float[Tensor, ""], Float[Tensor, "R"]]:
-    """What random backgrounds of a variance add to `photometric_loss` on their mean.
+def compare_colors(
+    rgb: Tensor, truth: Tensor, opacity: Tensor, pixels: Tensor, weights: Tensor | None, complete: Tensor | None,
+    variance: float,
+) -> PhotometricLosses:  # fmt: skip
+    """`photometric_loss` of composited colors [R, 3] in plain PyTorch, for every device.
 
     A channel's error on a background b is e + (alpha - opacity) * (b - mean): its expected square adds the variance of b times
     the squared error of the opacity. This mean over all colors has less noise than one color per ray.
     """
-    loss, squared_errors = mean_squared_error(opacity[:, None], pixels[:, 3:] / 255, weights, complete)
-    return variance * loss, variance * squared_errors
+    loss, squared_errors = _mean_squared_error(rgb, truth, weights, complete)
+    if not variance:
+        return loss, None, squared_errors
+    on_opacity, opacity_errors = _mean_squared_error(opacity[:, None], pixels[:, 3:] / 255, weights, complete)
+    return loss, variance * on_opacity, squared_errors + variance * opacity_errors
 
 
 def photometric_loss(
@@ -46,8 +52,8 @@ def photometric_loss(
     weights: Float[Tensor, "R"] | None = None,
     complete: Bool[Tensor, "R"] | None = None,
     variance: float = 0.0,
-) -> tuple[Float[Tensor, ""], Float[Tensor, ""] | None, Float[Tensor, "R"]]:
-    """Weighted mean squared error of rendered rays against photo pixels, that of their opacity, and each ray's sum of both.
+) -> PhotometricLosses:
+    """Compares rendered rays with photo pixels.
 
     Args:
         foreground, opacity: color without background, and opacity.
@@ -61,9 +67,5 @@ def photometric_loss(
         arguments = foreground, opacity, backgrounds, pixels, weights, complete, variance
         loss, on_opacity, squared_errors = gpu.composite.PhotometricLoss.apply(*arguments)
         return loss, on_opacity if variance else None, squared_errors
-    rgb = torch.addcmul(foreground, (1 - opacity)[:, None], backgrounds)
-    loss, squared_errors = mean_squared_error(rgb, composite_over(pixels, backgrounds), weights, complete)
-    if not variance:
-        return loss, None, squared_errors
-    on_opacity, opacity_errors = opacity_loss(opacity, pixels, variance, weights, complete)
-    return loss, on_opacity, squared_errors + opacity_errors
+    rgb, truth = torch.addcmul(foreground, (1 - opacity)[:, None], backgrounds), composite_over(pixels, backgrounds)
+    return compare_colors(rgb, truth, opacity, pixels, weights, complete, variance)

@@ -120,11 +120,10 @@ class VolumeRenderer(torch.nn.Module):
         has_gradient = density.requires_grad
         if samples.optical_depth is not None and not has_gradient:
             density = samples.optical_depth / samples.dt
-        packed = samples.t, samples.dt, samples.ray, samples.offsets
-        foreground, opacity, distance = composite(density, rgb, *packed)
+        foreground, opacity, distance = composite(density, rgb, *samples.packed)
         if self.unbounded and not has_gradient:
             # Median for unbounded scenes: 1 % of stray weight at the far plane would dominate the mean.
-            distance = opacity * median_depth(density, opacity, packed)
+            distance = opacity * median_depth(density, opacity, samples.packed)
         has_losses = self.distortion_loss_weight or self.near_loss_weight or self.view_loss_weight
         if not (self.training and has_gradient and (has_losses or samples.proposals is not None)):
             return RenderOutput(foreground, opacity, distance, backgrounds)  # a full view has too many samples to keep

@@ -34,7 +34,7 @@ class SampleCapacity:
     """
 
     HEADROOM = 1.25  # relative to the last count
-    MULTIPLE = 64  # of sizes: kernels are compiled for the alignment of their tensors
+    SIZE_MULTIPLE = 64  # of sizes: kernels are compiled for the alignment of their tensors
 
     def __init__(self) -> None:
         self.per_ray: dict[bool, tuple[float, float]] = {}
@@ -46,8 +46,8 @@ class SampleCapacity:
         """Capacities for marched and for kept steps; None to count exactly."""
         if is_full_pass not in self.per_ray:
             return None, None
-        counts = (self.HEADROOM * count * num_rays / self.MULTIPLE for count in self.per_ray[is_full_pass])
-        steps, kept = (self.MULTIPLE * math.ceil(count) for count in counts)
+        counts = (self.HEADROOM * count * num_rays / self.SIZE_MULTIPLE for count in self.per_ray[is_full_pass])
+        steps, kept = (self.SIZE_MULTIPLE * math.ceil(count) for count in counts)
         return steps, kept
 
     def record_counts(

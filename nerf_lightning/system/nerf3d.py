@@ -12,7 +12,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Rays
 from nerf_lightning.dataset import RayBatch, RayDataModule, ViewBatch
 from nerf_lightning.dataset.ray_datamodule import STEPS_PER_DRAW
-from nerf_lightning.kernels import mean_squared_error, opacity_loss, photometric_loss
+from nerf_lightning.kernels import compare_colors, photometric_loss
 from nerf_lightning.kernels.backend import get_kernels
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
@@ -155,18 +155,15 @@ class NeRF3D(System):
             samples = self.sampler(rays.detach(), self.field.density, generator)
         backgrounds = self.renderer.background.expand(len(rays), is_training=True)
         output = self.renderer(rays, samples, self.field, backgrounds)
-        weights, variance, on_opacity = (batch.weights, samples.complete), self.renderer.background.variance, None
+        options = batch.weights, samples.complete, self.renderer.background.variance
         if self.corrections is None:
             colors = output.foreground, output.opacity, backgrounds, batch.pixels
-            loss, on_opacity, squared_errors = photometric_loss(*colors, *weights, variance)
+            loss, on_opacity, squared_errors = photometric_loss(*colors, *options)
         else:
             assert batch.views is not None
             truth = composite_over(batch.pixels, backgrounds)
             rgb = self.corrections.color(output.rgb, output.opacity, backgrounds, batch.rays, batch.views, truth)
-            loss, squared_errors = mean_squared_error(rgb, truth, *weights)
-            if variance:
-                on_opacity, opacity_errors = opacity_loss(output.opacity, batch.pixels, variance, *weights)
-                squared_errors = squared_errors + opacity_errors
+            loss, on_opacity, squared_errors = compare_colors(rgb, truth, output.opacity, batch.pixels, *options)
         losses = {"photometric": loss, **self.regularize(output, samples, batch)}
         if on_opacity is not None:
             losses["opacity"] = on_opacity

@@ -21,6 +21,7 @@ SCENE = [
     *("dataset=bricks", "dataset.size=16", "dataset.train_views=12", "dataset.val_views=1", "dataset.rays=256"),
     *("dataset.samples=2048", "sampler.samples=32", "sampler.resolution=16", "callbacks.orbit=null"),
 ]
+SMALL_BRICKS = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1"]
 PICTURE = ["+experiment=picture", "dataset.max_side=24", "dataset.pixels=256", "callbacks.pictures=null"]
 GROWING = ["model.base_resolution=8", "model.max_resolution=16", "model.growth_end=1"]
 HASHGRID = ["model.num_levels=3", "model.max_resolution=32", "model.log2_hashmap_size=10", "model.width=16"]

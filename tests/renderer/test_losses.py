@@ -96,7 +96,7 @@ def test_median_depth_halves_opacity(counts: list[int]):
         return 1 - math.exp(-float((density[part] * (distance - start).clamp_min(0).minimum(samples.dt[part])).sum()))
 
     opacity = torch.tensor([opacity_before(ray, math.inf) for ray in range(len(counts))], dtype=torch.float64)
-    depth = median_depth(density, opacity, (samples.t, samples.dt, samples.ray, samples.offsets))
+    depth = median_depth(density, opacity, samples.packed)
     for ray, count in enumerate(counts):
         if count:
             assert opacity_before(ray, float(depth[ray])) == pytest.approx(float(opacity[ray]) / 2, rel=1e-6)
@@ -108,5 +108,5 @@ def test_median_depth_ignores_long_last_interval():
     samples = make_ragged_samples([3])
     samples.dt[2], samples.t[2] = 1000, 500
     density = torch.tensor([0.0, 1e3, 1e-5])
-    depth = median_depth(density, torch.tensor([0.99]), (samples.t, samples.dt, samples.ray, samples.offsets))
+    depth = median_depth(density, torch.tensor([0.99]), samples.packed)
     assert abs(float(depth) - float(samples.t[1])) < float(samples.dt[1])

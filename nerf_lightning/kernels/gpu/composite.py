@@ -12,7 +12,7 @@ from nerf_lightning.kernels.gpu.march import find_free_slots, pad_buffers
 
 BLOCK = 32
 """Samples of a ray at a time: one per thread of a warp."""
-RAYS = 128
+RAYS_PER_PROGRAM = 128
 """Rays per program of the photometric loss."""
 
 
@@ -235,7 +235,15 @@ class PhotometricLoss(torch.autograd.Function):
         shape = rays, *foreground.stride(), *backgrounds.stride(), variance
         constants = {"CHANNELS": channels, "HAS_WEIGHTS": weights is not None, "IS_PARTIAL": complete is not None}
         compare_colors(
-            (triton.cdiv(rays, RAYS),), *given, *masks, errors, losses, gradients, *shape, **constants, B=RAYS
+            (triton.cdiv(rays, RAYS_PER_PROGRAM),),
+            *given,
+            *masks,
+            errors,
+            losses,
+            gradients,
+            *shape,
+            **constants,
+            B=RAYS_PER_PROGRAM,
         )
         ctx.save_for_backward(gradients)
         ctx.mark_non_differentiable(errors)

@@ -4,12 +4,10 @@ import torch
 import triton.language as tl
 from torch import Tensor
 
+from nerf_lightning.kernels.gpu.composite import BLOCK
 from nerf_lightning.kernels.gpu.launch import kernel
 from nerf_lightning.kernels.march import Packed
 from nerf_lightning.kernels.weight_losses import NEAR_LOSS_POWER, RESIDUAL_EPS, TEXTURELESS_WEIGHT
-
-BLOCK = 32
-"""Samples of a ray at a time: one per thread of a warp."""
 
 
 @kernel(num_warps=1)
