@@ -4,7 +4,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from nerf_lightning.utils.seeding import Stream, step_generator  # noqa: E402
 from tests.helpers.fake_device import FakeTensor  # noqa: E402
 from tests.helpers.gpu_kernel_calls import list_calls  # noqa: E402
 from tests.helpers.kernel_comparison import values_and_gradients  # noqa: E402
+from tests.helpers.train_models import SMALL_BRICKS  # noqa: E402
 from tests.test_any_device import build_capture, build_system_and_data, train_steps  # noqa: E402
 
 CALLS = list_calls()
@@ -110,13 +111,7 @@ NUM_STEPS = [4, pytest.param(20, marks=pytest.mark.long)]
 def test_training_on_gpu_kernels_matches_reference(
     recipe: str, model: list[str], steps: int, launched: list[str], tmp_path: Path
 ):
-    small = [
-        "dataset=bricks",
-        "dataset.size=24",
-        "dataset.train_views=8",
-        "dataset.val_views=1",
-        "dataset.samples=null",
-    ]
+    small = [*SMALL_BRICKS, "dataset.samples=null"]
     options = [f"recipe={recipe}", *model, *small, "dataset.rays=6", "sampler.resolution=8", "+sampler.samples=24"]
     losses: dict[str, list[float]] = {}
     for choice in ("reference", "triton"):
@@ -133,33 +128,27 @@ MAX_LAUNCHES = {"hashgrid": 45, "tensorf": 41}
 """Kernels of a step, torch's and ours, without the draw of its rays."""
 
 
-@pytest.mark.parametrize("name", MAX_LAUNCHES)
-def test_training_step_on_gpu_kernels_needs_few_launches(
-    name: str, device: torch.device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Counts the second step after an update, whose buffers are of fixed size."""
-    run = launch.run_kernel
-
-    def run_on_cpu(kernel: launch.Kernel, grid: launch.Grid, arguments: Sequence[Any], constants: Any) -> None:
-        with _disable_current_modes():  # Triton's interpreter copies
-            run(kernel, grid, [x.cpu_tensor if isinstance(x, FakeTensor) else x for x in arguments], constants)
-
-    monkeypatch.setattr(launch, "run_kernel", run_on_cpu)
-    small = ["dataset=bricks", "dataset.size=24", "dataset.train_views=8", "dataset.val_views=1", "dataset.rays=6"]
-    small += ["sampler.resolution=8", "+sampler.samples=24", "sampler.warmup=0"]
-    system, data = build_system_and_data([f"recipe={name}_small", *small], tmp_path)
+def count_launches(system: Any, data: Any, steps: tuple[int, ...], device: torch.device) -> OpCounter:
+    """The counts of the last of some training steps; the first ones make what is then kept."""
     optimizer = system.to(device).configure_optimizers()
     set_kernels("triton")
-    try:
-        for step in (1, 2):
-            batch, generator = data.draw(step).to(device), step_generator(0, Stream.STEP, step, device)
-            with OpCounter() as count:
-                system.sampler.update(step, system.field.density, generator)
-                sum_losses(system.compute_losses(batch, generator)[0]).backward()
-                optimizer.step()
-                optimizer.zero_grad()
-    finally:
-        set_kernels("auto")
+    for step in steps:
+        batch, generator = data.draw(step).to(device), step_generator(0, Stream.STEP, step, device)
+        with OpCounter() as count:
+            system.sampler.update(step, system.field.density, generator)
+            sum_losses(system.compute_losses(batch, generator)[0]).backward()
+            optimizer.step()
+            optimizer.zero_grad()
+    return count
+
+
+@pytest.mark.parametrize("name", MAX_LAUNCHES)
+def test_training_step_on_gpu_kernels_needs_few_launches(
+    name: str, launched: list[str], device: torch.device, tmp_path: Path
+):
+    """Counts the second step after an update, whose buffers are of fixed size."""
+    small = [*SMALL_BRICKS, "dataset.rays=6", "sampler.resolution=8", "+sampler.samples=24", "sampler.warmup=0"]
+    count = count_launches(*build_system_and_data([f"recipe={name}_small", *small], tmp_path), (1, 2), device)
     assert 20 < count.operations <= MAX_LAUNCHES[name], count.names
     assert not count.waits
 
@@ -183,16 +172,6 @@ MAX_CAPTURE_LAUNCHES = 97
 
 
 def test_capture_step_on_device_needs_few_launches(launched: list[str], device: torch.device, tmp_path: Path):
-    system, data = build_capture(SMALL_GRID, 4, tmp_path)
-    optimizer = system.to(device).configure_optimizers()
-    set_kernels("triton")
-    for step in range(2):  # the first one makes what is then kept
-        batch, generator = data.draw(step).to(device), step_generator(0, Stream.STEP, step, device)
-        launched.clear()
-        with OpCounter() as count:
-            system.sampler.update(step, system.field.density, generator)
-            sum_losses(system.compute_losses(batch, generator)[0]).backward()
-            optimizer.step()
-            optimizer.zero_grad()
+    count = count_launches(*build_capture(SMALL_GRID, 4, tmp_path), (0, 1), device)
     assert count.waits == 0
     assert 20 < count.operations <= MAX_CAPTURE_LAUNCHES, count.names
