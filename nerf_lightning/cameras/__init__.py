@@ -4,7 +4,7 @@ from nerf_lightning.cameras.bounds import BoundedModule, Bounds
 from nerf_lightning.cameras.camera_layout import CameraLayout, classify_layout
 from nerf_lightning.cameras.cameras import Cameras, Rays, has_panoramas
 from nerf_lightning.cameras.lenses import Distortion, Lenses, Projection
-from nerf_lightning.cameras.paths import find_pivot, make_orbit_path, make_spiral_path, resample_path
+from nerf_lightning.cameras.paths import find_pivot, make_orbit_path, make_spiral_path, resample_path, start_at_middle
 from nerf_lightning.cameras.poses import (
     estimate_up,
     find_typical_view,
@@ -34,6 +34,7 @@ __all__ = [
     "pixel_to_camera",
     "find_pivot",
     "resample_path",
+    "start_at_middle",
     "make_spiral_path",
     "transform_points",
     "transform_directions",

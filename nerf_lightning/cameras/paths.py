@@ -170,6 +170,16 @@ def find_pivot(path: Cameras) -> Float[Tensor, "3"]:
     return c2w[0, :3, 3] + (center_spread(c2w) or 1.0) * c2w[0, :3, 2]
 
 
+def start_at_middle(path: Cameras) -> Cameras:
+    """Rotates a closed path to begin at its medoid: the view nearest to all others in position and direction."""
+    centers = path.centers.double()
+    poses = torch.cat(
+        [centers / ((centers - centers.mean(0)).norm(dim=1).mean() + 1e-12), path.c2w[:, :3, 2].double()], dim=1
+    )
+    first = int(torch.cdist(poses, poses).mean(1).argmin())
+    return path[(torch.arange(len(path)) + first) % len(path)]
+
+
 def make_spiral_path(orbit: Cameras, frames: int = 60) -> Cameras:
     """A closed spiral from an orbit inward and back, with the orbit's size and intrinsics.
 

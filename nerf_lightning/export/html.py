@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from omegaconf import OmegaConf
 
 import nerf_lightning
-from nerf_lightning.cameras import Cameras
+from nerf_lightning.cameras import Cameras, start_at_middle
 from nerf_lightning.drawing.panels import to_uint8
 from nerf_lightning.errors import InputError
 from nerf_lightning.export.bake import bake_system, is_web_renderable
@@ -43,12 +43,13 @@ def build_page(
     """Builds a run's web page; returns it with a summary. Options as in `cli.export.export_html`."""
     run = open_run(source, device)
     system: Any = run.system
-    if run.orbit is not None and source.is_file() and not photos and is_web_renderable(system):
+    orbit = None if run.orbit is None else start_at_middle(run.orbit)
+    if orbit is not None and source.is_file() and not photos and is_web_renderable(system):
         content = strip_local_paths(source.read_bytes())  # embedded unchanged
         facts = describe_run(source, run, [("size", f"{len(content) / 1000:,.1f} kB")])
-        return render_field_page(content, system, run.orbit, run.scene["name"], facts), "without photos"
+        return render_field_page(content, system, orbit, run.scene["name"], facts), "without photos"
     data = reload_data(run.cfg, run.scene, photos)
-    if run.orbit is None:
+    if orbit is None:
         view: Any = data.get_held_out_view(0).to(system.device)
         rgb = system.query_rgb(view.uv).view(view.height, view.width, 3)
         quality = f"PSNR {measure_held_out_psnr(system, data):.2f} dB"
@@ -68,8 +69,8 @@ def build_page(
     train, indices = data.scene.train, subsample(len(data.scene.train), MAX_PHOTOS)
     cameras, names = train.cameras[torch.tensor(indices)].to("cpu"), [train.name(i) for i in indices]
     facts = describe_run(source, run, measured)
-    poster = render_poster(baked.system, run.orbit) if isinstance(baked.system.field, HashGridField) else None
-    page = render_field_page(content, baked.system, run.orbit, data.scene.name, facts, cameras, names, poster)
+    poster = render_poster(baked.system, orbit) if isinstance(baked.system.field, HashGridField) else None
+    page = render_field_page(content, baked.system, orbit, data.scene.name, facts, cameras, names, poster)
     return page, f"held-out PSNR {original_psnr:.2f} -> {compact.psnr:.2f} dB" + (f" ({changes})" if changes else "")
 
 

@@ -48,7 +48,7 @@ class FieldPage(Page):
     Args:
         name: title.
         system: the system to render.
-        orbit: its first view is the home view.
+        orbit: its middle is the home view.
         scene: photos with cameras to show, if any.
         host, port: see `Page`.
         max_side: longer side of the finest image, pixels.

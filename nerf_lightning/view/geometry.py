@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
 
-from nerf_lightning.cameras import Bounds, Cameras, Rays, find_pivot, mean_up
+from nerf_lightning.cameras import Bounds, Cameras, Rays, find_pivot, mean_up, start_at_middle
 from nerf_lightning.dataset.resize import fit_size, resize_area
 from nerf_lightning.dataset.scene import Scene
 from nerf_lightning.dataset.views import Views
@@ -131,7 +131,8 @@ def compute_path_segments(cameras: Cameras) -> Float[np.ndarray, "N 2 3"]:
 
 
 def get_home_viewpoint(orbit: Cameras) -> tuple[Viewpoint, float]:
-    """The first view of an orbit as a viewpoint, and the mean distance to its focus."""
+    """The middle of an orbit as a viewpoint, and the mean distance to its focus."""
+    orbit = start_at_middle(orbit)
     focus = find_pivot(orbit)
     up = mean_up(orbit)
     distance = float((orbit.centers - focus).norm(dim=1).mean())
@@ -141,7 +142,7 @@ def get_home_viewpoint(orbit: Cameras) -> tuple[Viewpoint, float]:
 
 
 def get_overview_viewpoint(scene: Scene) -> Viewpoint:
-    """A viewpoint behind the orbit's start that shows all cameras and the bounds."""
+    """A viewpoint behind the orbit's middle that shows all cameras and the bounds."""
     home, _ = get_home_viewpoint(scene.orbit)
     points = torch.cat([scene.train.cameras.centers, scene.val.cameras.centers, scene.bounds.aabb]).numpy()
     radius = max(float(np.linalg.norm(points - home.look_at, axis=1).max()), 1e-6)

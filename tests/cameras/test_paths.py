@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from nerf_lightning.cameras import Cameras, find_pivot, make_orbit_path, make_spiral_path
+from nerf_lightning.cameras import Cameras, find_pivot, make_orbit_path, make_spiral_path, start_at_middle
 from nerf_lightning.dataset.region import find_region
 from tests.helpers.camera_paths import CENTER, RADIUS, UP, corridor, dome, forward, pan, ring_poses, walk
 
@@ -25,6 +25,17 @@ def make_cameras(c2w: torch.Tensor) -> Cameras:
 def make_orbit(c2w: torch.Tensor, frames: int) -> Cameras:
     region = find_region(c2w)
     return make_orbit_path(make_cameras(c2w), region.layout, region.center, frames)
+
+
+def test_path_starts_at_middle_of_an_arc():
+    orbit = make_orbit(ring_poses(degrees=150), 60)
+    started = start_at_middle(orbit)
+    ends = normalize(torch.stack([orbit.c2w[0, :3, 2], orbit.c2w[30, :3, 2]]), dim=1)
+    cosines = ends @ started.c2w[0, :3, 2]
+    torch.testing.assert_close(cosines[0], cosines[1], atol=0.1, rtol=0)
+    assert torch.equal(started.centers.sort(0).values, orbit.centers.sort(0).values)
+    assert torch.equal(started.c2w[1], orbit.c2w[(orbit.c2w == started.c2w[0]).all((1, 2)).nonzero()[0, 0] + 1])
+    assert len(start_at_middle(orbit[:1])) == 1
 
 
 @pytest.mark.parametrize("frames", [1, 60])

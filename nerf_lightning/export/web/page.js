@@ -21,6 +21,7 @@ class Page {
     this.camera = this.orbit[0].copy();
     this.up = about.up;
     this.turning = this.touched = false;
+    this.poster = Boolean(about.poster);    // whether the poster shows the view, below the fine picture's finished rows
     this.turnedFor = 0;                     // milliseconds
     this.moved = -REST;
     this.atRest = Promise.resolve();
@@ -35,6 +36,7 @@ class Page {
   changed(by = "touch") {
     this.moved = performance.now();
     this.dirty = true;
+    if (by !== "resize") this.poster = false;
     if (by === "touch") {
       this.turntable(false);
       this.flight = null;
@@ -68,12 +70,16 @@ class Page {
     else if (this.turning) this.onOrbit(this.turnedFor += passed);
     if (this.dirty) {
       this.dirty = false;
-      renderer.draw(this.camera, milliseconds, share);
-      this.canvas.style.background = "none";
+      renderer.rows = 0;
+      if (!this.poster) {
+        renderer.draw(this.camera, milliseconds, share);
+        this.canvas.style.background = "none";
+        this.canvas.dataset.drawn = "coarse";
+      }
       this.drawPhotos();
-      this.canvas.dataset.drawn = "coarse";
     } else if (now - this.moved > REST && !renderer.refine(camera, share)) {
       this.canvas.dataset.drawn = "fine";
+      this.poster = false;
       this.resting?.();
       this.resting = this.last = null;
       return;                               // idle until the next change

@@ -99,7 +99,6 @@ class Renderer {
     const side = length => Math.max(1, Math.round(length * Math.ceil(part * 12) / 12));  // few sizes, to reuse render targets
     this.coarse = this.picture(this.coarse, side(width), side(height));
     this.march(camera, this.coarse, 0, this.coarse.height);
-    this.rows = 0;
     this.present();
   }
 
@@ -108,7 +107,7 @@ class Renderer {
     const width = Math.max(1, Math.round(this.canvas.width * share)), height = Math.max(1, Math.round(this.canvas.height * share));
     this.fine = this.picture(this.fine, width, height);
     if (this.rows >= height) return false;
-    const high = Math.min(height, this.rows + Math.max(4, Math.floor(BAND / this.perPixel / width)));
+    const high = Math.min(height, this.rows + Math.max(1, Math.floor(BAND / this.perPixel / width)));
     this.march(camera, this.fine, this.rows, high);
     this.rows = high;
     this.present();
