@@ -11,7 +11,7 @@ from torch import Tensor
 from nerf_lightning.cameras import Bounds, Cameras
 from nerf_lightning.dataset import RayDataModule
 from nerf_lightning.dataset.ray_datamodule import make_batch
-from nerf_lightning.export.compress import MIN_OPACITY, CellMask, subsample_cameras
+from nerf_lightning.export.compress import MIN_OPACITY, CellMask, sample_views, subsample_cameras
 from nerf_lightning.export.volume import MAX_RESOLUTION, MIN_RESOLUTION
 from nerf_lightning.kernels import cell_index, volume_weights
 from nerf_lightning.model import Field, HashGridField, TensoRFField, VoxelField
@@ -153,16 +153,11 @@ def find_weighty_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
     pixels = int(cameras.sizes.prod(1).sum())
     cameras = cameras.rescale(min(1.0, math.sqrt(MAX_VISIBILITY_RAYS / pixels)))
     sums = torch.zeros(n**3, device=system.device)
-    for view in track_progress(range(len(cameras)), len(cameras), "views"):
-        rays = cameras.generate_view_rays(view)
-        for start in range(0, len(rays), system.chunk_rays):
-            chunk = rays[start : start + system.chunk_rays].to(system.device)
-            samples = system.sampler(chunk, system.field.density)
-            density = system.field.density(samples.positions(chunk))
-            weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
-            for end in (-0.5, 0.0, 0.5):  # an interval may cross cells
-                along = chunk.directions[samples.ray] * (samples.t + end * samples.dt)[:, None]
-                sums.index_add_(0, cell_index(bounds.to_unit(chunk.origins[samples.ray] + along), n), weights)
+    for rays, samples, density in sample_views(system, cameras):
+        weights = volume_weights(density, samples.dt, samples.ray, samples.offsets)
+        for end in (-0.5, 0.0, 0.5):  # an interval may cross cells
+            along = rays.directions[samples.ray] * (samples.t + end * samples.dt)[:, None]
+            sums.index_add_(0, cell_index(bounds.to_unit(rays.origins[samples.ray] + along), n), weights)
     ordered, order = sums.sort(descending=True)
     held = ordered.double().cumsum(0)
     mask = torch.zeros(n**3, dtype=torch.bool, device=system.device)

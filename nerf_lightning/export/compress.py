@@ -2,23 +2,24 @@
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from nerf_lightning.cameras import Cameras
+from nerf_lightning.cameras import Cameras, Rays
 from nerf_lightning.dataset import DataModule
 from nerf_lightning.dataset.pixel_subset import make_subset
 from nerf_lightning.errors import InputError
+from nerf_lightning.kernels import cell_index
 from nerf_lightning.model.layers.grid_masks import dilate
 from nerf_lightning.runs.compact import decode_run, encode_system
 from nerf_lightning.runs.scene_file import scene_to_dict
-from nerf_lightning.sampler import OccupancySampler
+from nerf_lightning.sampler import OccupancySampler, Samples
 from nerf_lightning.system import NeRF3D, System
 from nerf_lightning.utils.progress import track_progress
 from nerf_lightning.utils.text import subsample
@@ -52,23 +53,26 @@ def find_seen_cells(system: NeRF3D, cameras: Cameras) -> CellMask | None:
     return dilate(find_visible_cells(system, cameras, len(occupied))) & occupied
 
 
+def sample_views(system: NeRF3D, cameras: Cameras) -> Iterator[tuple[Rays, Samples, Float[Tensor, "N"]]]:
+    """Rays of all views in chunks, with their samples and the density there."""
+    for view in track_progress(range(len(cameras)), len(cameras), "views"):
+        all_rays = cameras.generate_view_rays(view)
+        for start in range(0, len(all_rays), system.chunk_rays):
+            rays = all_rays[start : start + system.chunk_rays].to(system.device)
+            samples = system.sampler(rays, system.field.density)
+            yield rays, samples, system.field.density(samples.positions(rays))
+
+
 @torch.no_grad()
 def find_visible_cells(system: NeRF3D, cameras: Cameras, n: int) -> CellMask:
     """Cells of an n^3 grid over the bounds in which any camera sees content; ray spacing matches the cells."""
     bounds = system.field.bounds
     cell = (4 if bounds.unbounded else 2) * bounds.max_half_size / n
     factor = min(MAX_RAYS_PER_PIXEL_SIDE, math.ceil(cameras.pixel_footprint(bounds.content_center.cpu()) / cell))
-    supersampled = cameras.rescale(factor)
     seen = torch.zeros(n**3, dtype=torch.bool, device=system.device)
-    for view in track_progress(range(len(supersampled)), len(supersampled), "views"):
-        rays = supersampled.generate_view_rays(view)
-        for start in range(0, len(rays), system.chunk_rays):
-            chunk = rays[start : start + system.chunk_rays].to(system.device)
-            samples = system.sampler(chunk, system.field.density)
-            positions = samples.positions(chunk)
-            opacity = 1 - torch.exp(-system.field.density(positions) * samples.dt)
-            x, y, z = (bounds.to_unit(positions[opacity > MIN_OPACITY]) * n).long().clamp(0, n - 1).unbind(1)
-            seen[(x * n + y) * n + z] = True
+    for rays, samples, density in sample_views(system, cameras.rescale(factor)):
+        is_content = 1 - torch.exp(-density * samples.dt) > MIN_OPACITY
+        seen[cell_index(bounds.to_unit(samples.positions(rays)[is_content]), n)] = True
     return seen.view(n, n, n)
 
 

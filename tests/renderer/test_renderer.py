@@ -118,6 +118,20 @@ def test_near_loss_fades_out():
     assert others == [{}, {}]
 
 
+def test_gradients_shrink_near_camera():
+    samples, rays = make_ragged_samples([4]), Rays(torch.zeros(1, 3), torch.eye(3)[:1])
+    outputs, gradients = [], []
+    for distance in (0.0, 2.0):
+        density, rgb = torch.ones(4, requires_grad=True), torch.full((4, 3), 0.5, requires_grad=True)
+        renderer = VolumeRenderer(gradient_scaling_distance=distance, half_size=float(samples.t[2]) / 2)
+        output = renderer(rays, samples, lambda *_, field=(density, rgb): field)
+        outputs.append(output.rgb.detach())
+        gradients.append(torch.autograd.grad(output.rgb.sum(), (density, rgb)))
+    scale = torch.stack([samples.t[0] / samples.t[2], samples.t[1] / samples.t[2], *torch.ones(2)]) ** 2
+    assert torch.equal(*outputs)
+    torch.testing.assert_close(gradients[1], (gradients[0][0] * scale, gradients[0][1] * scale[:, None]))
+
+
 @torch.no_grad()
 def test_neighbors_share_view_residual(kernels: str, monkeypatch: pytest.MonkeyPatch):
     bounds, rays = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True), along_z(20)
