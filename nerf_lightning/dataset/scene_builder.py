@@ -36,10 +36,10 @@ from nerf_lightning.errors import InputError
 log = logging.getLogger(__name__)
 
 BLACK = (0.0, 0.0, 0.0)
-NEAR_FRACTION = 0.25
-"""Near plane as a fraction of the nearest camera's distance to the common subject."""
 CONTENT_NEAR_FRACTION = 0.7
-"""Near plane as a fraction of the nearest known content's distance; the smaller of the two counts."""
+"""Near plane as a fraction of the nearest known content's distance."""
+NEAR_FRACTION = 0.25
+"""Without known content: near plane as a fraction of the nearest camera's distance to the common subject."""
 MAX_CORE_HALF_SIZE = 0.5
 """Half-size of a core, in distances to the subject, from which perspective spacing gains nothing."""
 MAX_NEAR_POINTS, OUTLIER_QUANTILE = 4096, 0.01
@@ -207,21 +207,22 @@ def find_bounds(
     views: Views, kind: SceneKind, from_source: Float[Tensor, "4 4"], hints: Hints, region: Region
 ) -> Bounds:
     """Bounds from the file or the silhouettes; for an unbounded scene the cube [-1, 1]^3, with a near plane in front of the
-    nearest known content or the subject."""
+    nearest known content, without any in front of the subject."""
     scale = float(torch.linalg.det(from_source[:3, :3])) ** (1 / 3)
     near, far = (None if x is None else x * scale for x in (hints.near, hints.far))
     if hints.bounds is not None:
         return replace(hints.bounds, near=near, far=far)
     if kind.bounded:
         return estimate_bounds(views, kind.background, near, far)
-    nears = [] if hints.nearest_depth is None else [CONTENT_NEAR_FRACTION * (hints.nearest_depth * scale)]
+    nearest = math.inf if hints.nearest_depth is None else hints.nearest_depth * scale
     if hints.points is not None and len(hints.points):
         points = transform_points(from_source, torch.from_numpy(hints.points)).float()
-        nears.append(CONTENT_NEAR_FRACTION * find_nearest_distance(points, views))
-    if region.has_subject:
-        nears.append(NEAR_FRACTION * min(1.0, float(views.cameras.centers.norm(dim=1).min())))
-    near = min(nears, default=None) if near is None else near
-    core = find_core(views.cameras, near or NEAR_FRACTION) if region.layout == CameraLayout.FORWARD else None
+        nearest = min(nearest, find_nearest_distance(points, views))
+    if near is None and nearest < math.inf:
+        near = CONTENT_NEAR_FRACTION * nearest
+    elif near is None and region.has_subject:
+        near = NEAR_FRACTION * min(1.0, float(views.cameras.centers.norm(dim=1).min()))
+    core = find_core(views.cameras, min(near or 1.0, NEAR_FRACTION)) if region.layout == CameraLayout.FORWARD else None
     if core is not None and far is None:
         far = UNBOUNDED_FAR_HALF_SIZES  # of the box, not of the core
     return Bounds(torch.tensor([[-1.0] * 3, [1.0] * 3]), unbounded=True, near=near, far=far, core=core)

@@ -65,7 +65,8 @@ def made(recipe: str, precision: str = "byte", unbounded: bool = False) -> bytes
 def page_of(compact: bytes, name: str = "made") -> tuple[str, LoadedRun]:
     run = decode_run(compact, "made")
     assert isinstance(run.system, NeRF3D) and run.orbit is not None
-    return render_field_page(compact, run.system, run.orbit, name, [("note", name)], run.orbit, [name] * 4), run
+    poster = np.zeros((4, 4, 3), np.uint8)
+    return render_field_page(compact, run.system, run.orbit, name, [("note", name)], run.orbit, [name] * 4, poster), run
 
 
 @pytest.fixture(scope="module")
@@ -130,6 +131,10 @@ def test_render_field_page_handles_input_and_lost_context(browser: Any, tmp_path
     hint = page.locator("#hint")
     assert hint.is_visible() and "gone" not in (hint.get_attribute("class") or "")
     first = page.evaluate(look)
+    background, coarse = "document.getElementById('view').style.background", "field.renderer.coarse"
+    assert "image/jpeg" in page.evaluate(background) and page.evaluate(coarse) is None, (
+        "the fine picture covers the poster"
+    )
 
     def drag() -> None:
         page.mouse.down()
@@ -151,6 +156,7 @@ def test_render_field_page_handles_input_and_lost_context(browser: Any, tmp_path
         assert (changed[0] != first[0]) == moves
         first = changed
     assert hint.get_attribute("class") == "gone", "after the first drag"
+    assert page.evaluate(background) == "none"
     lose = "() => { window.lost = field.renderer.gl.getExtension('WEBGL_lose_context'); lost.loseContext(); }"
     page.evaluate(lose)
     page.wait_for_selector("#view[data-drawn=lost]")
