@@ -38,8 +38,9 @@ log = logging.getLogger(__name__)
 BLACK = (0.0, 0.0, 0.0)
 CONTENT_NEAR_FRACTION = 0.7
 """Near plane as a fraction of the nearest known content's distance."""
-NEAR_FRACTION = 0.25
-"""Without known content: near plane as a fraction of the nearest camera's distance to the common subject."""
+NEAR_FRACTION, MAX_NEAR_FRACTION = 0.25, 0.5
+"""Near plane without known content, and farthest with it, as fractions of the nearest camera's distance to the common
+subject, which may have few points."""
 MAX_CORE_HALF_SIZE = 0.5
 """Half-size of a core, in distances to the subject, from which perspective spacing gains nothing."""
 MAX_NEAR_POINTS, OUTLIER_QUANTILE = 4096, 0.01
@@ -218,10 +219,11 @@ def find_bounds(
     if hints.points is not None and len(hints.points):
         points = transform_points(from_source, torch.from_numpy(hints.points)).float()
         nearest = min(nearest, find_nearest_distance(points, views))
+    subject = min(1.0, float(views.cameras.centers.norm(dim=1).min())) if region.has_subject else math.inf
     if near is None and nearest < math.inf:
-        near = CONTENT_NEAR_FRACTION * nearest
-    elif near is None and region.has_subject:
-        near = NEAR_FRACTION * min(1.0, float(views.cameras.centers.norm(dim=1).min()))
+        near = min(CONTENT_NEAR_FRACTION * nearest, MAX_NEAR_FRACTION * subject)
+    elif near is None and subject < math.inf:
+        near = NEAR_FRACTION * subject
     core = find_core(views.cameras, min(near or 1.0, NEAR_FRACTION)) if region.layout == CameraLayout.FORWARD else None
     if core is not None and far is None:
         far = UNBOUNDED_FAR_HALF_SIZES  # of the box, not of the core
