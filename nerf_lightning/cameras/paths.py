@@ -172,10 +172,8 @@ def find_pivot(path: Cameras) -> Float[Tensor, "3"]:
 
 def start_at_middle(path: Cameras) -> Cameras:
     """Rotates a closed path to begin at its medoid: the view nearest to all others in position and direction."""
-    centers = path.centers.double()
-    poses = torch.cat(
-        [centers / ((centers - centers.mean(0)).norm(dim=1).mean() + 1e-12), path.c2w[:, :3, 2].double()], dim=1
-    )
+    centers = path.centers.double() / (center_spread(path.c2w) or 1.0)
+    poses = torch.cat([centers, path.c2w[:, :3, 2].double()], dim=1)
     first = int(torch.cdist(poses, poses).mean(1).argmin())
     return path[(torch.arange(len(path)) + first) % len(path)]
 

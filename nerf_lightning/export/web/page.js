@@ -70,8 +70,8 @@ class Page {
     else if (this.turning) this.onOrbit(this.turnedFor += passed);
     if (this.dirty) {
       this.dirty = false;
-      renderer.rows = 0;
-      if (!this.poster) {
+      if (this.poster) renderer.restart();
+      else {
         renderer.draw(this.camera, milliseconds, share);
         this.canvas.style.background = "none";
         this.canvas.dataset.drawn = "coarse";

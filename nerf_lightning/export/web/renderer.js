@@ -99,8 +99,12 @@ class Renderer {
     const side = length => Math.max(1, Math.round(length * Math.ceil(part * 12) / 12));  // few sizes, to reuse render targets
     this.coarse = this.picture(this.coarse, side(width), side(height));
     this.march(camera, this.coarse, 0, this.coarse.height);
+    this.restart();
     this.present();
   }
+
+  // Starts the fine picture anew.
+  restart() { this.rows = 0; }
 
   // Renders the next band of the picture at rest; false when it is complete.
   refine(camera, share) {

@@ -234,17 +234,8 @@ class PhotometricLoss(torch.autograd.Function):
         masks = errors if weights is None else weights.contiguous(), pixels if complete is None else complete
         shape = rays, *foreground.stride(), *backgrounds.stride(), variance
         constants = {"CHANNELS": channels, "HAS_WEIGHTS": weights is not None, "IS_PARTIAL": complete is not None}
-        compare_colors(
-            (triton.cdiv(rays, RAYS_PER_PROGRAM),),
-            *given,
-            *masks,
-            errors,
-            losses,
-            gradients,
-            *shape,
-            **constants,
-            B=RAYS_PER_PROGRAM,
-        )
+        grid = (triton.cdiv(rays, RAYS_PER_PROGRAM),)
+        compare_colors(grid, *given, *masks, errors, losses, gradients, *shape, **constants, B=RAYS_PER_PROGRAM)
         ctx.save_for_backward(gradients)
         ctx.mark_non_differentiable(errors)
         ctx.set_materialize_grads(False)
