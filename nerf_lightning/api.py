@@ -86,7 +86,7 @@ class Run:
 
     def render(self, camera: Cameras) -> View:
         """Renders the first of the cameras, for example `scene.val.cameras[0]`; the result is on the CPU."""
-        output = self.system.render(camera.generate_view_rays(0).to(self.system.device))
+        output = self.system.render(camera.generate_view_rays(0).to(self.system.device), width=camera.width)
         shape = (camera.height, camera.width)
         rgb, opacity, depth = (x.cpu() for x in (output.rgb, output.opacity, output.depth))
         return View(rgb.clamp(0, 1).view(*shape, 3), opacity.view(shape), depth.view(shape))

@@ -67,7 +67,7 @@ class Orbit(RenderingCallback):
         for view in range(len(cameras)):
             before = render_timer.seconds
             with render_timer.measure(f"orbit, frame {view + 1} of {len(cameras)}"):
-                rgb = system.render(cameras.generate_view_rays(view)).rgb
+                rgb = system.render(cameras.generate_view_rays(view), width=cameras.width).rgb
                 image = to_uint8(rgb.view(cameras.height, cameras.width, 3))
             render_timer.add_timing(len(rgb), render_timer.seconds - before)
             self._done_fraction = (view + 1) / len(cameras)

@@ -49,8 +49,8 @@ def render_channels(
 ) -> dict[str, UInt8[ndarray, "H W C"]]:
     """Renders the channels of a view; C is 4, with straight alpha, for a transparent background."""
     rays = cameras.generate_view_rays(view).to(system.device)
-    rendered = system.render(rays, background=style.background or BLACK)
     width, height = cameras.size(view)
+    rendered = system.render(rays, background=style.background or BLACK, width=width)
     shape = (height, width, -1)
     return {name: to_uint8(render_channel(rendered, name, style).view(shape)) for name in style.channels}
 

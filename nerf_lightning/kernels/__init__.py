@@ -10,7 +10,7 @@ from nerf_lightning.kernels.harmonics import spherical_harmonics
 from nerf_lightning.kernels.hashgrid import hash_interpolate
 from nerf_lightning.kernels.march import cell_index, march, mark_cells, pack_intervals, ray_positions
 from nerf_lightning.kernels.march_until_opaque import march_until_opaque
-from nerf_lightning.kernels.merge import average_neighbors, merge_low_weight
+from nerf_lightning.kernels.merge import merge_low_weight
 from nerf_lightning.kernels.mlp import mlp, mlp_heads
 from nerf_lightning.kernels.photometric import compare_colors, composite_over, photometric_loss
 from nerf_lightning.kernels.proposals import interlevel_loss, proposal_weights
@@ -27,7 +27,6 @@ from nerf_lightning.kernels.voxels import (
 from nerf_lightning.kernels.weight_losses import weight_losses
 
 __all__ = [
-    "average_neighbors",
     "median_depth",
     "interlevel_loss",
     "interval_midpoints",

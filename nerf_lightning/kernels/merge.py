@@ -1,7 +1,7 @@
-"""Merging of neighboring samples before color evaluation: low-weight ones, or their features."""
+"""Merging of neighboring samples of low weight before color evaluation."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.kernels import cpu
@@ -9,8 +9,6 @@ from nerf_lightning.kernels.backend import has_fast_kernel
 from nerf_lightning.kernels.composite import PackedSelection, volume_weights
 from nerf_lightning.kernels.march import Packed, offsets_from_counts
 
-FeatureGroups = tuple[Float[Tensor, "G F"], Int[Tensor, "N"], Int[Tensor, "G"]]
-"""Features of groups of samples, the group of each sample, and the ray of each group."""
 MergedSamples = tuple[Float[Tensor, "K"], PackedSelection]
 """Optical depth of the K remaining samples, and their intervals."""
 MAX_MIDPOINT_DISTANCE = 0.625
@@ -62,40 +60,3 @@ def merge_low_weight(optical_depth: Float[Tensor, "N"], packed: Packed, min_weig
     out, rays = torch.empty(3, int(kept[-1])), torch.empty(int(kept[-1]), dtype=torch.int64)
     cpu.merge.merge_pairs(weight_fraction, offsets, kept, optical_depth, t, dt, out, rays)
     return out[0], (out[1], out[2], rays, kept)
-
-
-def average_neighbors_reference(
-    optical_depth: Tensor, features: Tensor, ray: Tensor, offsets: Tensor, size: int
-) -> FeatureGroups:
-    """`average_neighbors` in plain PyTorch, for every device."""
-    weights = volume_weights(optical_depth, torch.ones_like(optical_depth), ray, offsets)[:, None] + 1e-10
-    position = torch.arange(len(ray), device=ray.device) - offsets.index_select(0, ray)
-    is_first = position % size == 0
-    index, group_ray = is_first.cumsum(0) - 1, ray[is_first]
-    values = torch.cat([weights * features, weights], dim=1)
-    sums = values.new_zeros(len(group_ray), values.shape[1]).index_add_(0, index, values)
-    return sums[:, :-1] / sums[:, -1:], index, group_ray
-
-
-def average_neighbors(
-    optical_depth: Float[Tensor, "N"],
-    features: Float[Tensor, "N F"],
-    ray: Int[Tensor, "N"],
-    offsets: Int[Tensor, "R_plus_1"],
-    size: int,
-) -> FeatureGroups:
-    """Mean features, by rendering weight, of every `size` consecutive samples of a ray; a ray's last group may be smaller.
-
-    Args:
-        optical_depth: optical depth of each sample, density times length.
-        features: features of each sample.
-        ray, offsets: see `volume_weights`.
-    """
-    if not has_fast_kernel(constants=(optical_depth, features)):
-        return average_neighbors_reference(optical_depth, features, ray, offsets, size)
-    counts = (offsets.diff() + size - 1) // size
-    group_offsets = offsets_from_counts(counts)
-    means, index = torch.empty(features.shape[1], int(group_offsets[-1])), torch.empty_like(ray)
-    arguments = optical_depth, features.T, offsets, group_offsets, size, torch.empty(len(ray)), index, means
-    cpu.composite.average_neighbors(*arguments)
-    return means.T, index, torch.arange(len(counts)).repeat_interleave(counts)

@@ -171,18 +171,10 @@ class HashGridField(Field):
     def density(self, positions: Float[Tensor, "N 3"]) -> Float[Tensor, "N"]:
         return self.features(positions, self.unit_length)[0]
 
-    def view_logits(self, features: Float[Tensor, "N F"], directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """View-dependent part of the color logits, see `FieldOutput`; only with `view_residual`."""
-        return mlp(features, layer_parameters(self.color_net), encode_directions(directions, self.terms))
-
-    def shade(self, features: Float[Tensor, "N F"], view_logits: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-        """Features and their `view_logits` -> rgb in [0, 1]."""
-        return torch.sigmoid(features[:, :3] + view_logits)
-
     def forward(self, positions: Float[Tensor, "N 3"], directions: Float[Tensor, "N 3"]) -> FieldOutput:
         density, features = self.features(positions, self.unit_length)
+        layers, basis = layer_parameters(self.color_net), encode_directions(directions, self.terms)
         if not self.view_residual:
-            layers, basis = layer_parameters(self.color_net), encode_directions(directions, self.terms)
             return FieldOutput(density, mlp(features, layers, basis, torch.sigmoid))
-        logits = self.view_logits(features, directions)
-        return FieldOutput(density, self.shade(features, logits), logits)
+        logits = mlp(features, layers, basis)
+        return FieldOutput(density, torch.sigmoid(features[:, :3] + logits), logits)

@@ -9,14 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from nerf_lightning.cameras import Rays
-from nerf_lightning.kernels import average_neighbors, composite, median_depth, volume_weights, weight_losses
-from nerf_lightning.model import FieldOutput, HashGridField
+from nerf_lightning.kernels import composite, median_depth, volume_weights, weight_losses
+from nerf_lightning.model import FieldOutput
 from nerf_lightning.renderer.background import Background
 from nerf_lightning.sampler import Samples
 from nerf_lightning.utils.option_checks import Ge, LossWeight
 
-SHADING_GROUP = 4
-"""Neighboring samples that share a view-dependent residual in evaluation of unbounded scenes."""
 NEAR_LOSS_END = 0.7
 """Training progress at which the near loss has faded out, so that surfaces it pushed back can recover."""
 AUTO_VIEW_LOSS_WEIGHT = {False: 0.01, True: 0.001}
@@ -55,14 +53,6 @@ class RenderOutput:
     def depth(self) -> Float[Tensor, "R"]:
         """Depth along the ray, world units: the mean, for unbounded scenes the median; 0 where opacity is 0."""
         return self.distance / self.opacity.clamp_min(1e-6)
-
-
-def shade_groups(field: HashGridField, rays: Rays, samples: Samples) -> FieldOutput:
-    """Field at samples, with one view-dependent residual for every `SHADING_GROUP` neighbors, of their mean features."""
-    density, features = field.features(samples.positions(rays), field.unit_length)
-    means, index, ray = average_neighbors(density * samples.dt, features, samples.ray, samples.offsets, SHADING_GROUP)
-    residual = field.view_logits(means, rays.directions.index_select(0, ray))
-    return FieldOutput(density, field.shade(features, residual.T.index_select(1, index).T))
 
 
 def scale_gradients(
@@ -133,12 +123,7 @@ class VolumeRenderer(torch.nn.Module):
         """Renders rays over `backgrounds`, by default the renderer's background."""
         if backgrounds is None:
             backgrounds = self.background.expand(len(rays))
-        # Proposals put samples of even weight close together; others are merged by weight already.
-        is_dense = self.unbounded and samples.optical_depth is None and not torch.is_grad_enabled()
-        if is_dense and isinstance(field, HashGridField) and field.view_residual:
-            density, rgb, view_residual = shade_groups(field, rays, samples)
-        else:
-            density, rgb, view_residual = FieldOutput(*field(samples.positions(rays), samples.directions(rays)))
+        density, rgb, view_residual = FieldOutput(*field(samples.positions(rays), samples.directions(rays)))
         has_gradient = density.requires_grad
         if has_gradient and self.full_gradient_distance:
             scale_gradients(density, rgb, samples.t, self.full_gradient_distance)

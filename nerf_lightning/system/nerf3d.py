@@ -1,5 +1,6 @@
 """NeRF3D: fits a radiance field to rays."""
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -16,7 +17,7 @@ from nerf_lightning.kernels import compare_colors, photometric_loss
 from nerf_lightning.kernels.backend import get_kernels
 from nerf_lightning.model import Field
 from nerf_lightning.refine import Corrections
-from nerf_lightning.renderer import RenderOutput, VolumeRenderer, composite_over
+from nerf_lightning.renderer import RenderOutput, VolumeRenderer, composite_over, render_checkerboard
 from nerf_lightning.sampler import CHUNK, Sampler, Samples, split_by_rays
 from nerf_lightning.system.correction_trial import CorrectionTrials
 from nerf_lightning.system.growth import FieldGrowth, sync_resolution_scale
@@ -226,7 +227,12 @@ class NeRF3D(System):
 
     @torch.no_grad()
     def render(
-        self, rays: Rays, near: float = 0.0, far: float = math.inf, background: Sequence[float] | None = None
+        self,
+        rays: Rays,
+        near: float = 0.0,
+        far: float = math.inf,
+        background: Sequence[float] | None = None,
+        width: int = 1,
     ) -> RenderOutput:
         """Renders rays without gradient or randomness, in chunks.
 
@@ -234,9 +240,17 @@ class NeRF3D(System):
             rays: on the system's device.
             near, far: visible range along each ray, in scene units.
             background: color in [0, 1]; None takes the renderer's.
+            width: of the view whose rows the rays are, which lets unbounded scenes interpolate smooth pixels.
         """
         color = self.renderer.background.color if background is None else torch.tensor(background, device=self.device)
-        outputs, start, num_rays, max_samples = [], 0, self.chunk_rays, SAMPLE_CHUNKS_PER_PASS * self.chunk
+        march = functools.partial(self._march, near=near, far=far)
+        is_view = self.renderer.unbounded and 1 < width < len(rays)
+        values = render_checkerboard(march, rays, width) if is_view else march(rays)
+        return RenderOutput(values[:, :3], values[:, 3], values[:, 4], color.expand(len(rays), 3))
+
+    def _march(self, rays: Rays, near: float, far: float) -> Float[Tensor, "R 5"]:
+        """Foreground color, opacity and distance of rays."""
+        values, start, num_rays, max_samples = [], 0, self.chunk_rays, SAMPLE_CHUNKS_PER_PASS * self.chunk
         chunk_samples = self.chunk * (self.field.cpu_chunks if self.device.type == "cpu" else 1)
         while start < len(rays):
             chunk = rays[start : start + num_rays]
@@ -247,10 +261,9 @@ class NeRF3D(System):
             if near > 0 or far < math.inf:
                 samples = samples.clip(near, far)
             for span, part in split_by_rays(samples.merge_low_weight_samples(), chunk_samples):
-                outputs.append(self.renderer(chunk[span], part, self.field, color.expand(len(chunk[span]), 3)))
-        names = ("foreground", "opacity", "distance")
-        foreground, opacity, distance = (torch.cat([getattr(output, name) for output in outputs]) for name in names)
-        return RenderOutput(foreground, opacity, distance, color.expand(len(rays), 3))
+                output = self.renderer(chunk[span], part, self.field)
+                values.append(torch.cat([output.foreground, output.opacity[:, None], output.distance[:, None]], 1))
+        return torch.cat(values) if values else rays.origins.new_zeros(0, 5)
 
     @property
     def background(self) -> list[float]:
@@ -260,5 +273,5 @@ class NeRF3D(System):
         return composite_over(batch.pixels, self.renderer.background.expand(len(batch.rays), is_training))
 
     def render_view(self, view: ViewBatch) -> tuple[Tensor, Tensor, Tensor]:
-        rendered = self.render(view.rays)
+        rendered = self.render(view.rays, width=view.width if view.strip is None else 1)
         return rendered.rgb, rendered.depth, rendered.opacity

@@ -85,17 +85,18 @@ class ProgressiveRenderer:
         """Renders a request at one resolution; None if canceled by `is_current`."""
         depths = self.get_depth_range() if request.channel == "depth" else (0.0, 1.0)
         style = FrameStyle((request.channel,), request.background, depths)
-        device, batch_size = self.system.device, CHUNKS_PER_CHECK * self.system.chunk_rays
+        device = self.system.device
         synchronize(device)  # exclude queued work from the timing
         began = time.perf_counter()
         cameras = request.cameras(side).to(device)
-        rays = cameras.generate_view_rays(0)
+        rays, width = cameras.generate_view_rays(0), cameras.width
+        batch_size = max(2, CHUNKS_PER_CHECK * self.system.chunk_rays // width) * width  # whole rows
         parts = []
         for start in range(0, len(rays), batch_size):
             if not is_current():
                 return None
             chunk = rays[start : start + batch_size]
-            rendered = self.system.render(chunk, request.near, request.far, request.background)
+            rendered = self.system.render(chunk, request.near, request.far, request.background, width)
             parts.append(render_channel(rendered, request.channel, style))
         image = to_uint8(torch.cat(parts).view(cameras.height, cameras.width, 3))
         self.rays_per_second = 0.5 * self.rays_per_second + 0.5 * len(rays) / max(time.perf_counter() - began, 1e-4)

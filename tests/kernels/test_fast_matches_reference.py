@@ -74,12 +74,6 @@ def filter_visible(draw: DRAW) -> Case:
     return Case(call, [], rtol=0, atol=0)
 
 
-def average_neighbors(draw: DRAW) -> Case:
-    t, dt, ray, offsets = packed(draw(COUNTS))
-    features, size = torch.randn(5, len(t)).T, draw(st.integers(1, 5))
-    return Case(lambda: list(k.average_neighbors(3 * torch.sin(7 * t) ** 2, features, ray, offsets, size)), [])
-
-
 def median_depth(draw: DRAW) -> Case:
     given = packed(draw(COUNTS))
     density = 5 * torch.sin(7 * given[0]) ** 2
@@ -199,9 +193,7 @@ def proposals(draw: DRAW) -> Case:
 LEARNING = [composite, spherical_harmonics, hash_interpolate, mlp, planes, ray_positions, voxels]
 
 
-@pytest.mark.parametrize(
-    "kernel", [*LEARNING, filter_visible, merge_low_weight, average_neighbors, median_depth, march, proposals]
-)
+@pytest.mark.parametrize("kernel", [*LEARNING, filter_visible, merge_low_weight, median_depth, march, proposals])
 @given(data=st.data(), seed=st.integers(0, 1000))
 def test_fast_kernel_any_input_matches_reference(kernel: Callable[[DRAW], Case], data: st.DataObject, seed: int):
     torch.manual_seed(seed)

@@ -5,9 +5,9 @@ from torch import Generator, Tensor
 from nerf_lightning.cameras import Bounds, Rays
 from nerf_lightning.errors import InputError
 from nerf_lightning.kernels import photometric_loss
-from nerf_lightning.model import FieldOutput, HashGridField
-from nerf_lightning.renderer import VolumeRenderer, composite_over, renderer
-from nerf_lightning.sampler import ProposalSampler, UniformSampler
+from nerf_lightning.model import FieldOutput
+from nerf_lightning.renderer import VolumeRenderer, composite_over
+from nerf_lightning.sampler import UniformSampler
 from tests.helpers.ragged_samples import make_ragged_samples
 
 SCENE = (0.2, 0.4, 0.6)
@@ -130,19 +130,3 @@ def test_gradients_shrink_near_camera():
     scale = torch.stack([samples.t[0] / samples.t[2], samples.t[1] / samples.t[2], *torch.ones(2)]) ** 2
     assert torch.equal(*outputs)
     torch.testing.assert_close(gradients[1], (gradients[0][0] * scale, gradients[0][1] * scale[:, None]))
-
-
-@torch.no_grad()
-def test_neighbors_share_view_residual(kernels: str, monkeypatch: pytest.MonkeyPatch):
-    bounds, rays = Bounds(torch.tensor([[-1.0, -1, -1], [1, 1, 1]]), unbounded=True), along_z(20)
-    field, samples = HashGridField(bounds, 2, 10, view_residual=True), ProposalSampler(bounds)(rays, lambda x: x[:, 0])
-    field.grid.tables.normal_()
-    view_logits, evaluated = field.view_logits, []
-    monkeypatch.setattr(field, "view_logits", lambda *inputs: evaluated.append(len(inputs[0])) or view_logits(*inputs))
-    exact, colors = field(samples.positions(rays), samples.directions(rays)).rgb, []
-    for size in (1, 4):
-        monkeypatch.setattr(renderer, "SHADING_GROUP", size)
-        colors.append(renderer.shade_groups(field, rays, samples).rgb)
-    assert evaluated == [320, 320, 80]
-    torch.testing.assert_close(colors[0], exact)
-    assert 0 < float((colors[1] - exact).abs().mean()) < 0.05

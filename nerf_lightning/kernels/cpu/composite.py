@@ -2,7 +2,7 @@
 
 import math
 
-from numba import float32, prange
+from numba import prange
 
 from nerf_lightning.kernels.cpu.jit import kernel
 
@@ -117,24 +117,3 @@ def find_median_depth(density, opacity, t, dt, offsets, depth):
                 depth[ray] = t[n] + (min(max((target - passed) / max(step, 1e-12), 0.0), 1.0) - 0.5) * dt[n]
                 break
             passed += step
-
-
-@kernel
-def average_neighbors(optical_depth, features, offsets, group_offsets, size, weights, index, means):
-    """Fills weights [N], index [N] and means [F, G] from features [F, N]: see `nerf_lightning.kernels.merge`."""
-    for ray in prange(len(offsets) - 1):
-        optical, through, group = 0.0, 1.0, group_offsets[ray]
-        for first in range(offsets[ray], offsets[ray + 1], size):
-            last, total = min(first + size, offsets[ray + 1]), 0.0
-            for n in range(first, last):
-                optical += optical_depth[n]
-                behind = math.exp(-optical)
-                weights[n], index[n] = through - behind + 1e-10, group  # without weight, the plain mean
-                through, total = behind, total + weights[n]
-            for n in range(first, last):
-                weights[n] /= total
-            group += 1
-    for f in prange(len(features)):
-        means[f] = float32(0)
-        for n in range(len(weights)):
-            means[f, index[n]] += weights[n] * features[f, n]
