@@ -136,8 +136,8 @@ def test_occupancy_resize_keeps_maximum(monkeypatch: pytest.MonkeyPatch):
             assert float(new[x, y, z]) == expected, name
     sampler.requested_samples = None
     sampler.set_resolution_scale(3.0)
-    assert sampler.grid.resolution == 24 and sampler.samples == 72
-    assert sampler.grid.optical_depth.max() == pytest.approx(before["optical_depth"].max() * 36 / 72)
+    assert sampler.grid.resolution == 24 and sampler.samples == 216
+    assert sampler.grid.optical_depth.max() == pytest.approx(before["optical_depth"].max() * 54 / 216)
 
 
 def test_occupancy_state_of_any_stage_loads():
@@ -148,7 +148,7 @@ def test_occupancy_state_of_any_stage_loads():
     full.load_state_dict(late.state_dict())
     rendering.import_state(late.export_state())
     for loaded in (full, rendering):
-        assert torch.equal(loaded.grid.occupied, late.grid.occupied) and loaded.samples == late.samples == 240
+        assert torch.equal(loaded.grid.occupied, late.grid.occupied) and loaded.samples == late.samples == 300
     full.load_state_dict(early.state_dict())
     assert full.samples == 192 and len(full.grid.optical_depth) == 64**3
 
