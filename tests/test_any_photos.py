@@ -76,8 +76,8 @@ def test_run_on_mixed_masked_fisheye_writes_outputs(folder: Path, tmp_path: Path
 def test_run_nan_renders_is_collapsed(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     render_well = NeRF3D.render
 
-    def render_badly(self: NeRF3D, *given: Any) -> RenderOutput:
-        rendered = render_well(self, *given)
+    def render_badly(self: NeRF3D, *given: Any, **options: Any) -> RenderOutput:
+        rendered = render_well(self, *given, **options)
         self.corrections.poses.pose_adjustment.data.fill_(torch.nan)
         return replace(rendered, foreground=rendered.rgb * torch.nan, backgrounds=None)
 
