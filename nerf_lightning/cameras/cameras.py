@@ -128,8 +128,8 @@ class Cameras(TensorDataclass):
         """Footprint of one pixel at a point, world units: the median over the views."""
         return float(((self.centers - point).norm(dim=1) / self.K[:, 0, 0]).median())
 
-    def generate_rays(self, view: Int[Tensor, "R"], row: Int[Tensor, "R"], col: Int[Tensor, "R"]) -> Rays:
-        """Rays through the centers of the given pixels."""
+    def generate_rays(self, view: Int[Tensor, "#R"], row: Int[Tensor, "R"], col: Int[Tensor, "R"]) -> Rays:
+        """Rays through the centers of the given pixels, of a view each or of one view."""
         u, v = col.to(self.K.dtype) + 0.5, row.to(self.K.dtype) + 0.5
         if self.lenses is None:
             u_axis, v_axis, offset = self.pixel_axes[view].unbind(1)
@@ -141,7 +141,9 @@ class Cameras(TensorDataclass):
             normalized = undistort(pixels_to_normalized(self.K[view], points), coefficients, start, steps=1)
             local = normalized_to_directions(normalized, self.lenses.projection[view])
             directions = (self.c2w[view, :3, :3] * local[:, None]).sum(2)
-        return Rays(self.centers[view], torch.nn.functional.normalize(directions, dim=1))
+        return Rays(
+            self.centers[view].expand_as(directions).contiguous(), torch.nn.functional.normalize(directions, dim=1)
+        )
 
     @cached_property
     def pixel_axes(self) -> Float[Tensor, "V 3 3"]:
@@ -151,7 +153,7 @@ class Cameras(TensorDataclass):
         inverse = torch.linalg.solve_triangular(K, identity, upper=True)
         return (rotation @ inverse).mT.to(self.K).contiguous()
 
-    def _interpolate_undistorted(self, view: Int[Tensor, "R"], points: Float[Tensor, "R 2"]) -> Float[Tensor, "R 2"]:
+    def _interpolate_undistorted(self, view: Int[Tensor, "#R"], points: Float[Tensor, "R 2"]) -> Float[Tensor, "R 2"]:
         """Undistorted normalized coordinates of pixels, bilinear from the table: the start of one Newton step."""
         lens_index, tables, scale = self._undistort_tables
         lens = lens_index[view]
@@ -180,7 +182,7 @@ class Cameras(TensorDataclass):
         """Rays of all H*W pixels of one view, row by row."""
         width, height = self.size(view)
         pixel = torch.arange(height * width, device=self.K.device)
-        return self.generate_rays(torch.full_like(pixel, view), pixel // width, pixel % width)
+        return self.generate_rays(pixel.new_full((1,), view), pixel // width, pixel % width)
 
     def project(
         self, points: Float[Tensor, "N 3"], view: int

@@ -76,7 +76,7 @@ def make_view_batch(views: Views, view: int, subset: PixelSubset = ALL_PIXELS) -
     """Builds a batch of one view, or of a subset of its pixels."""
     rows, columns = subset.grid(*views.cameras.size(view))
     row, column = (x.flatten() for x in torch.meshgrid(rows, columns, indexing="ij"))
-    rays = views.cameras.generate_rays(torch.full_like(row, view), row, column)
+    rays = views.cameras.generate_rays(row.new_full((1,), view), row, column)
     valid = None if views.valid_mask is None else views.view_mask(view)[row, column]
     return ViewBatch(rays, views.image(view)[row, column], len(rows), len(columns), valid, subset.strip)
 

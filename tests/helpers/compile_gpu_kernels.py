@@ -1,4 +1,4 @@
-"""Compiles GPU kernels for several cards without a GPU, and launches one on a stub driver; prints what it finds as JSON.
+"""Compiles GPU kernels for compute capabilities without a GPU, and launches one on a stub driver; prints what it finds as JSON.
 
 A process of its own, as in the others Triton interprets.
 """
@@ -7,6 +7,7 @@ import ctypes
 import json
 import re
 import subprocess
+import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -41,7 +42,7 @@ CALLS = (
     "locate_samples",
     "photometric_loss",
 )
-CAPABILITIES = (75, 80, 90)
+CAPABILITIES = [int(capability) for capability in sys.argv[1:]]
 CUOBJDUMP = Path(triton.backends.nvidia.__file__).parent / "bin" / "cuobjdump"
 USAGE = re.compile(r"REG:(\d+) STACK:(\d+) SHARED:(\d+) LOCAL:(\d+)")
 PTX_TYPES = {"u64": ctypes.c_uint64, "u32": ctypes.c_int32, "f32": ctypes.c_float}
@@ -100,7 +101,7 @@ def main() -> None:
     stub: dict[str, Any] = {}
 
     def compile_only(kernel: launch.Kernel, grid: Any, arguments: Any, constants: Any) -> None:
-        for capability in CAPABILITIES[kernel.name.startswith("mlp.") :]:
+        for capability in (c for c in CAPABILITIES if c >= 80 or not kernel.name.startswith("mlp.")):
             compiled = kernel.compile(capability, arguments, constants)
             measured, most = measure_usage(compiled.asm["cubin"]), usage.setdefault(kernel.name, {})
             most[capability] = {name: max(n, most.get(capability, {}).get(name, 0)) for name, n in measured.items()}
