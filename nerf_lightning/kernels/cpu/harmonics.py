@@ -4,25 +4,24 @@ import numpy as np
 from numba import float32, prange
 
 from nerf_lightning.kernels.cpu.jit import kernel
+from nerf_lightning.kernels.cpu.mlp import TILE, copy_columns
 
 C0, C1 = float32(0.28209479177387814), float32(0.48860251190291987)
 C2A, C2B, C2C = float32(1.0925484305920792), float32(0.31539156525252005), float32(0.5462742152960396)
 C3A, C3B, C3C = float32(0.5900435899266435), float32(2.890611442640554), float32(0.4570457994644657)
 C3D, C3E = float32(0.3731763325901154), float32(1.445305721320277)
-TILE = 256
-"""Directions evaluated together, in vector code: the functions of one lie far apart in the output."""
 
 
 @kernel
 def evaluate(directions, out):
-    """Fills out [16, N] for unit directions [N, 3]."""
+    """Fills out [16, N] for unit directions [N, 3], in tiles: the functions of a direction lie far apart in it."""
     one, three, five = float32(1), float32(3), float32(5)
     for index in prange((len(directions) + TILE - 1) // TILE):
         first = index * TILE
         count = min(TILE, len(directions) - first)
         axes, tile = np.zeros((3, TILE), np.float32), np.empty((16, TILE), np.float32)
         for n in range(count):
-            axes[0, n], axes[1, n], axes[2, n] = directions[first + n]
+            axes[0, n], axes[1, n], axes[2, n] = directions[first + n, 0], directions[first + n, 1], directions[first + n, 2]
         for n in range(TILE):
             x, y, z = axes[0, n], axes[1, n], axes[2, n]
             xx, yy, zz = x * x, y * y, z * z
@@ -42,4 +41,4 @@ def evaluate(directions, out):
             tile[13, n] = -C3C * x * (five * zz - one)
             tile[14, n] = C3E * z * (xx - yy)
             tile[15, n] = -C3A * x * (xx - three * yy)
-        out[:, first : first + count] = tile[:, :count]
+        copy_columns(tile, 0, out, first, count)
