@@ -97,7 +97,7 @@ def test_self_test_finds_wrong_or_failing_kernel(monkeypatch: pytest.MonkeyPatch
     assert self_test.find_failure(torch.device("cpu")) == "march: ZeroDivisionError: division by zero"
 
 
-NUM_STEPS = [4, pytest.param(20, marks=pytest.mark.long)]
+NUM_STEPS = [3, pytest.param(20, marks=pytest.mark.long)]
 
 
 @pytest.mark.parametrize("steps", NUM_STEPS)
