@@ -8,7 +8,7 @@ from torch import Tensor
 
 from nerf_lightning.cameras import Rays
 
-MAX_NEIGHBOR_SPREAD = 12 / 255
+MAX_NEIGHBOR_SPREAD = 16 / 255
 """Difference in color and opacity among four neighbors up to which the pixel between them is interpolated."""
 
 

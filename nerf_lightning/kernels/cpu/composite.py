@@ -11,14 +11,12 @@ from nerf_lightning.kernels.cpu.jit import kernel
 def forward(density, rgb, t, dt, offsets, color, opacity, depth, transmittance):
     """Fills color [3, R], opacity [R], depth [R], and the transmittance before each sample [N]."""
     for ray in prange(len(offsets) - 1):
-        optical = 0.0  # float64: sums over a ray exceed float32 precision
+        through = 1.0  # float64: sums over a ray exceed float32 precision
         red, green, blue, alpha, distance = 0.0, 0.0, 0.0, 0.0, 0.0
         for n in range(offsets[ray], offsets[ray + 1]):
-            through = math.exp(-optical)
-            step = density[n] * dt[n]
-            weight = through * -math.expm1(-step)
+            weight = through * -math.expm1(-density[n] * dt[n])
             transmittance[n] = through
-            optical += step
+            through -= weight
             red += weight * rgb[0, n]
             green += weight * rgb[1, n]
             blue += weight * rgb[2, n]
