@@ -97,8 +97,7 @@ def launch_on_stub(compiled: Any, num_warps: int, arguments: Sequence[Tensor | i
 
 
 def main() -> None:
-    usage: dict[str, dict[int, dict[str, int]]] = {}
-    stub: dict[str, Any] = {}
+    usage, stub = dict[str, dict[int, dict[str, int]]](), dict[str, Any]()
 
     def compile_only(kernel: launch.Kernel, grid: Any, arguments: Any, constants: Any) -> None:
         for capability in (c for c in CAPABILITIES if c >= 80 or not kernel.name.startswith("mlp.")):
