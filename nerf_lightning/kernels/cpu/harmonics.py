@@ -14,7 +14,7 @@ C3D, C3E = float32(0.3731763325901154), float32(1.445305721320277)
 
 @kernel
 def evaluate(directions, out):
-    """Fills out [16, N] for unit directions [N, 3], tile by tile: a direction's values are N apart."""
+    """Fills out [16, N], in tiles, for unit directions [N, 3]."""
     one, three, five = float32(1), float32(3), float32(5)
     for index in prange((len(directions) + TILE - 1) // TILE):
         first = index * TILE
