@@ -21,11 +21,8 @@ def evaluate(directions, out):
         count = min(TILE, len(directions) - first)
         axes, tile = np.zeros((3, TILE), np.float32), np.empty((16, TILE), np.float32)
         for n in range(count):
-            axes[0, n], axes[1, n], axes[2, n] = (
-                directions[first + n, 0],
-                directions[first + n, 1],
-                directions[first + n, 2],
-            )
+            direction = directions[first + n]
+            axes[0, n], axes[1, n], axes[2, n] = direction[0], direction[1], direction[2]
         for n in range(TILE):
             x, y, z = axes[0, n], axes[1, n], axes[2, n]
             xx, yy, zz = x * x, y * y, z * z
