@@ -160,14 +160,14 @@ class RayDataModule(StepDataModule[Views]):
         self._with_texture = is_enabled
 
     def set_resolution_scale(self, scale: float) -> None:
-        """Scales the target samples with `Field.resolution_scale`: smaller cells get fewer samples and noisier gradients."""
+        """Scales the target samples with the square of `Field.resolution_scale`, as a ray has more steps and is worth less."""
         self._resolution_scale = scale
 
     def adapt_num_rays(self, num_samples: int, steps: int = 1) -> None:
         """Moves the number of rays toward the target samples, given those of the last step, as `steps` calls would."""
         if self.samples is None:
             return
-        target = self.rays * round(self.samples * self._resolution_scale) / max(num_samples, 1)
+        target = self.rays * round(self.samples * self._resolution_scale**2) / max(num_samples, 1)
         limit = self.initial_rays * self.MAX_RAYS_FACTOR  # empty space would need infinitely many rays
         damping = RAY_DAMPING**steps
         self.rays = max(min(64, limit), min(limit, round(damping * self.rays + (1 - damping) * min(target, limit))))

@@ -83,14 +83,14 @@ def test_over_alpha_blends_with_background():
     torch.testing.assert_close(composite_over(pixels, torch.full((3, 3), 0.5)), expected)
 
 
-@pytest.mark.parametrize(("first", "samples_per_ray"), [(100, 0.5), (1000, 3.0)])
-def test_adapt_num_rays_converges_to_target_samples(first: int, samples_per_ray: float, scene: Scene):
-    data = RayDataModule(scene, rays=first, samples=6000)
-    most = 0
+@pytest.mark.parametrize(("first", "samples_per_ray", "scale"), [(100, 0.5, 1.0), (1000, 3.0, 1.0), (1000, 3.0, 2.0)])
+def test_adapt_num_rays_converges_to_target_samples(first: int, samples_per_ray: float, scale: float, scene: Scene):
+    data, most = RayDataModule(scene, rays=first, samples=6000), 0
+    data.set_resolution_scale(scale)
     for _ in range(60):
         data.adapt_num_rays(round(data.rays * samples_per_ray))
         most = max(most, data.rays)
-    aim = max(64, min(6000 / samples_per_ray, first * 32))
+    aim = max(64, min(6000 * scale**2 / samples_per_ray, first * 32))
     assert abs(data.rays - aim) <= 0.01 * aim + 2
     assert most <= max(first, 1.02 * aim), "without overshoot"
     assert len(data.draw(0).pixels) == data.rays
