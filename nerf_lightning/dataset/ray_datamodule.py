@@ -160,7 +160,7 @@ class RayDataModule(StepDataModule[Views]):
         self._with_texture = is_enabled
 
     def set_resolution_scale(self, scale: float) -> None:
-        """Scales the target samples with the square of `Field.resolution_scale`, as a ray has more steps and is worth less."""
+        """Scales the target samples with the square of `Field.resolution_scale`, as the steps of a ray do."""
         self._resolution_scale = scale
 
     def adapt_num_rays(self, num_samples: int, steps: int = 1) -> None:
