@@ -3,7 +3,7 @@ VENV ?= .venv
 PYTHON ?= python3
 BIN := $(VENV)/bin
 
-# What is imported is compiled once, and not by each process anew; pip would compile three times as much, on one core.
+# Python writes the bytecode of what it imports, once for all processes; pip would compile three times as many files, on one core.
 export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: run test suite long quick lint format docs clean
